@@ -1,0 +1,33 @@
+# Everything starts here. `tools/uv` is uv, installed on first use.
+UV := ./tools/uv
+DEV := $(UV) run --group dev
+
+.PHONY: help train test test-slow check format bench docs
+
+help:  ## Show this list.
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+train:  ## Train the cartpole swing-up on this machine's CPU until it is solved.
+	$(UV) run train Mjlab-Cartpole-Swingup --num-envs 512 --device cpu --result-video True
+
+test:  ## Run the test suite.
+	$(DEV) pytest -n 2 -m "not slow" tests
+
+test-slow:  ## Run the tests that take long.
+	$(DEV) pytest -m slow tests
+
+check:  ## Check format, lint, types and import layers.
+	$(DEV) ruff format --check .
+	$(DEV) ruff check .
+	$(DEV) ty check
+	$(DEV) lint-imports
+
+format:  ## Format the code and fix what lint can fix.
+	$(DEV) ruff format .
+	$(DEV) ruff check --fix .
+
+bench:  ## Measure; writes the table to benchmarks/results/.
+	$(DEV) python benchmarks/run.py
+
+docs:  ## Build the documentation into docs/_build/html.
+	$(UV) run --group docs sphinx-build -W --keep-going -b html docs docs/_build/html

@@ -1,0 +1,218 @@
+"""The seam between mjlab and a physics engine.
+
+Everything above this file sees batched torch tensors; everything below it is one engine's own
+business. `sim/engines/native.py` and `sim/engines/warp.py` are the only two implementations and the
+only two files that import `mjbatch`, `warp` or `mujoco_warp`. `create_engine` imports them lazily,
+so a CPU run never loads Warp and `import mjlab.envs` works with either package missing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import mujoco
+    import torch
+
+    from mjlab.sim.config import SimulationCfg
+
+
+# Fields that MuJoCo stores as nine numbers in a row and that cross the seam as 3 x 3 matrices.
+ROTATION_MATRICES = frozenset(
+    {"xmat", "ximat", "geom_xmat", "site_xmat", "cam_xmat", "cam_mat0"}
+)
+
+
+class EngineUnavailableError(RuntimeError):
+    """Raised at construction when the chosen engine cannot run here; says what to use instead."""
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """What an engine is and can do. Read when a task is built, never in the step loop."""
+
+    name: str
+    """`native` or `warp`."""
+    device: str
+    """Torch device on which all fields live."""
+    description: str
+    """One line for people: the library, its version, the device, the number of threads."""
+    num_threads: int | None = None
+    """Physics threads, or None where the engine has no such notion."""
+    raycast: bool = True
+    """Whether `Engine.raycast` works."""
+    render: bool = False
+    """Whether `Engine.render` works."""
+
+
+class Engine(ABC):
+    """N copies of one MuJoCo model, advanced together.
+
+    Fields carry MuJoCo's names and shapes with a leading environment dimension N, as float32,
+    int32 or bool tensors on one device; rotation matrices are (..., 3, 3). They are live: the
+    engine writes results into them, and what is written into them in place is the input of the
+    next call. A tensor returned by `data_field` stays valid for the life of the engine.
+
+    `env_ids` is None for all environments, or a sorted, unique, one-dimensional int64 tensor.
+    """
+
+    capabilities: Capabilities
+
+    @abstractmethod
+    def data_field(self, name: str) -> torch.Tensor:
+        """Return the live (N, ...) tensor of an `MjData` field.
+
+        A derived field holds current values as soon as it is returned, whether or not it was
+        asked for before.
+
+        Raises:
+            AttributeError: the engine has no such field; the message lists close names.
+        """
+
+    @abstractmethod
+    def model_field(self, name: str) -> torch.Tensor:
+        """Return the live (N, ...) tensor of an expanded `MjModel` (or `MjOption`) field.
+
+        Raises:
+            ValueError: the field has not been expanded.
+        """
+
+    @abstractmethod
+    def expand(self, fields: tuple[str, ...]) -> None:
+        """Give every environment its own copy of `MjModel` fields, seeded with the shared values.
+
+        Fields that are expanded already are left alone.
+
+        Raises:
+            ValueError: the engine cannot hold the field per environment, by name.
+        """
+
+    @abstractmethod
+    def is_expanded(self, field: str) -> bool:
+        """Return whether the model field is held per environment."""
+
+    @abstractmethod
+    def constants_written_by(self, level: int) -> tuple[str, ...]:
+        """Return the model fields that `recompute_constants(level)` writes."""
+
+    @abstractmethod
+    def recompute_constants(self, level: int, env_ids: torch.Tensor | None) -> None:
+        """Recompute constants that derive from expanded fields; qpos and qvel stay as they are.
+
+        `level` is a `RecomputeLevel` value (1 fixed, 2 at qpos0, 3 both). An engine may do more
+        than the level asks for. Expands what it writes.
+        """
+
+    @abstractmethod
+    def step(self, nstep: int) -> None:
+        """Advance all environments by `nstep` physics steps."""
+
+    @abstractmethod
+    def forward(self, env_ids: torch.Tensor | None) -> None:
+        """Make derived fields current with the state, without advancing time."""
+
+    @abstractmethod
+    def reset(self, env_ids: torch.Tensor | None) -> None:
+        """Put environments into the model's initial state: time 0, qpos0, everything else zero.
+
+        Derived fields and model fields keep their values until `forward`.
+        """
+
+    @abstractmethod
+    def raycast(
+        self,
+        origins: torch.Tensor,
+        directions: torch.Tensor,
+        geom_groups: tuple[int, ...] | None,
+        exclude_body_ids: torch.Tensor | None,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Cast R world-frame rays per environment.
+
+        Args:
+            origins: (N, R, 3) metres. directions: (N, R, 3) unit vectors.
+            geom_groups: groups that can be hit; None means all six.
+            exclude_body_ids: (R,) int32 body whose own geoms are ignored, -1 for none.
+
+        Returns:
+            distances (N, R), -1 on a miss; normals (N, R, 3), zero on a miss; geom ids (N, R)
+            int32, -1 on a miss.
+        """
+
+    @abstractmethod
+    def jacobian(
+        self, points: torch.Tensor, body_ids: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Jacobians of one world-frame point per environment, moving with a body.
+
+        Args:
+            points: (N, 3) metres. body_ids: (N,) int32.
+
+        Returns:
+            Translational and rotational Jacobian, each (N, 3, nv), world frame.
+        """
+
+    @abstractmethod
+    def copy_to_host(self, env_idx: int, mj_data: mujoco.MjData) -> None:
+        """Write the full state of one environment into `mj_data`, without a forward pass."""
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything an exact resume needs, as tensors and plain values on the CPU."""
+
+    @abstractmethod
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned; derived fields are current afterwards."""
+
+    def close(self) -> None:  # noqa: B027 - optional hook: most engines hold nothing to free.
+        """Free what the engine holds outside Python's reach."""
+
+
+_ENGINES = {
+    "native": ("mjlab.sim.engines.native", "NativeEngine"),
+    "warp": ("mjlab.sim.engines.warp", "WarpEngine"),
+}
+
+
+def resolve_engine_name(requested: str, device: str) -> str:
+    """Return `native` or `warp` for a `SimulationCfg.engine` value and a torch device.
+
+    Raises:
+        ValueError: unknown engine name.
+        EngineUnavailableError: an engine that cannot serve the device.
+    """
+    on_cpu = device.split(":")[0] == "cpu"
+    if requested == "auto":
+        return "native" if on_cpu else "warp"
+    if requested not in _ENGINES:
+        raise ValueError(
+            f"Unknown engine {requested!r}. Choose one of: auto, {', '.join(_ENGINES)}."
+        )
+    if requested == "native" and not on_cpu:
+        raise EngineUnavailableError(
+            f"The native engine runs on the CPU, but the device is {device!r}. "
+            "Use --device cpu, or --engine warp."
+        )
+    return requested
+
+
+def create_engine(
+    name: str, model: mujoco.MjModel, num_envs: int, cfg: SimulationCfg, device: str
+) -> Engine:
+    """Build the engine called `name` (a result of `resolve_engine_name`).
+
+    Raises:
+        EngineUnavailableError: its package is missing or it cannot run on this machine.
+    """
+    module_name, class_name = _ENGINES[name]
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        other = "warp" if name == "native" else "native"
+        raise EngineUnavailableError(
+            f"The {name} engine cannot be loaded: {error}. Install the missing package "
+            f"(mjlab depends on it by default), or use --engine {other}."
+        ) from error
+    return getattr(module, class_name)(model, num_envs, cfg, device)

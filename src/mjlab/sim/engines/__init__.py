@@ -1,0 +1,1 @@
+"""The two implementations of `mjlab.sim.engine.Engine`. Nothing is imported until one is chosen."""

@@ -1,0 +1,334 @@
+"""Native MuJoCo on CPU threads, through `mjbatch`.
+
+The simulations live as double-precision state rows inside `mjbatch.Batch`. What crosses the seam
+are float32 copies of the fields that somebody asked for: `mjbatch` copies changed elements in
+before each call and every bound field out after it. So a field costs time only once it is read.
+"""
+
+from __future__ import annotations
+
+import copy
+import difflib
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+import mjbatch
+import mujoco
+import numpy as np
+import torch
+
+from mjlab.sim.engine import ROTATION_MATRICES, Capabilities, Engine, EngineUnavailableError
+
+if TYPE_CHECKING:
+    from mjlab.sim.config import SimulationCfg
+
+# State components that physics itself changes: bound from the start, so that `reset` can reach
+# them. The others change only by being written, and whoever writes them binds them first.
+_ALWAYS_BOUND = ("time", "qpos", "qvel", "act", "qacc_warmstart", "ctrl")
+_ZERO_ON_RESET = (
+    "time",
+    "qvel",
+    "act",
+    "qacc_warmstart",
+    "ctrl",
+    "qfrc_applied",
+    "xfrc_applied",
+    "userdata",
+)
+_INPUT_FIELDS = frozenset((*_ZERO_ON_RESET, "qpos", "eq_active", "mocap_pos", "mocap_quat"))
+
+# What mj_setConst writes. `Batch.set_const` would bind these as double; they are expanded as
+# float32 first, so that they can be read through the seam.
+_DERIVED_CONSTANTS = (
+    "body_subtreemass",
+    "body_invweight0",
+    "dof_invweight0",
+    "dof_M0",
+    "tendon_length0",
+    "tendon_invweight0",
+    "actuator_acc0",
+    "actuator_biasprm",
+    "eq_data",
+    "cam_pos0",
+    "cam_poscom0",
+    "cam_mat0",
+    "light_pos0",
+    "light_poscom0",
+    "light_dir0",
+)
+
+# The compiler marks frames that coincide and MuJoCo then skips their transforms, so the marks
+# have to go before such a frame is randomized.
+_FRAME_MARKS = {
+    "body_ipos": ("body_sameframe", "geom_sameframe", "site_sameframe"),
+    "body_iquat": ("body_sameframe", "geom_sameframe", "site_sameframe"),
+    "geom_pos": ("geom_sameframe",),
+    "geom_quat": ("geom_sameframe",),
+    "site_pos": ("site_sameframe",),
+    "site_quat": ("site_sameframe",),
+}
+_INERTIAL_FRAME = ("body_ipos", "body_iquat")
+
+# Changing these per environment would change which contacts and array sizes exist.
+_STRUCTURAL_FIELDS = frozenset({"geom_type", "geom_bodyid", "body_parentid", "jnt_type", "eq_type"})
+
+
+class NativeEngine(Engine):
+    """MuJoCo's own C code, one thread pool for all environments, bit-reproducible."""
+
+    def __init__(
+        self, model: mujoco.MjModel, num_envs: int, cfg: SimulationCfg, device: str
+    ) -> None:
+        if cfg.num_threads < 0:
+            raise ValueError(
+                f"SimulationCfg.num_threads is {cfg.num_threads}; give 0 for all cores, or more."
+            )
+        self.num_envs = num_envs
+        self._model = copy.copy(model)
+        # MuJoCo would put a diverged environment back to qpos0 by itself and hide the NaN from
+        # the guard and from the environment, which count it and reset that environment.
+        self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        try:
+            self._batch = mjbatch.Batch(self._model, num_envs, cfg.num_threads)
+        except (ValueError, RuntimeError) as error:
+            raise EngineUnavailableError(
+                f"The native engine refuses this model: {error}. Use --engine warp."
+            ) from error
+        self._arrays: dict[str, np.ndarray] = {}
+        self._tensors: dict[str, torch.Tensor] = {}
+        self._model_arrays: dict[str, np.ndarray] = {}
+        self._model_tensors: dict[str, torch.Tensor] = {}
+        for name in _ALWAYS_BOUND:
+            self._bind(name)
+        self._qpos0 = torch.from_numpy(self._model.qpos0.astype(np.float32))
+        self._eq_active0 = torch.from_numpy(np.array(self._model.eq_active0, dtype=bool))
+        self._mocap_body = torch.from_numpy(np.flatnonzero(self._model.body_mocapid >= 0))
+        threads = self._batch.num_threads
+        self.capabilities = Capabilities(
+            name="native",
+            device="cpu",
+            description=(
+                f"native (mjbatch {version('mjbatch')}, MuJoCo {mujoco.__version__}), "
+                f"device cpu, {threads} physics thread{'s' if threads != 1 else ''}"
+            ),
+            num_threads=threads,
+        )
+        self._batch.forward()
+
+    # Fields.
+
+    def data_field(self, name: str) -> torch.Tensor:
+        if name not in self._tensors:
+            tensor = self._bind(name)
+            # A derived field reads zero until the next call, so make the call.
+            if name not in _INPUT_FIELDS and tensor.numel():
+                self._batch.forward()
+        return self._tensors[name]
+
+    def _bind(self, name: str) -> torch.Tensor:
+        array = _as_float32(self._batch.bind, name, "MjData")
+        self._arrays[name] = array
+        self._tensors[name] = _as_tensor(name, array)
+        return self._tensors[name]
+
+    def model_field(self, name: str) -> torch.Tensor:
+        if name not in self._model_tensors:
+            raise ValueError(f"MjModel field {name!r} has not been expanded.")
+        return self._model_tensors[name]
+
+    def is_expanded(self, field: str) -> bool:
+        return field in self._model_tensors
+
+    def expand(self, fields: tuple[str, ...]) -> None:
+        for name in fields:
+            if name in self._model_tensors:
+                continue
+            self._check_expandable(name)
+            for mark in _FRAME_MARKS.get(name, ()):
+                if mark not in self._model_arrays:
+                    self._model_arrays[mark] = self._batch.expand(mark)
+                    self._model_arrays[mark][:] = 0
+            array = _as_float32(self._batch.expand, name, "MjModel")
+            self._model_arrays[name] = array
+            self._model_tensors[name] = _as_tensor(name, array)
+
+    def _check_expandable(self, name: str) -> None:
+        if name in _STRUCTURAL_FIELDS:
+            raise ValueError(
+                f"Model field {name!r} is part of the model's structure and cannot differ between "
+                "environments. Use several entities, or several tasks."
+            )
+        if name in _INERTIAL_FRAME and self._model.body_simple.any():
+            bodies = [
+                mujoco.mj_id2name(self._model, mujoco.mjtObj.mjOBJ_BODY, int(i)) or f"#{int(i)}"
+                for i in np.flatnonzero(self._model.body_simple)
+            ]
+            raise ValueError(
+                f"Model field {name!r} cannot differ between environments, because the compiler "
+                f"simplified the inertia of bodies {', '.join(bodies)}. Build the Simulation from a "
+                "spec (spec=...), or compile those bodies with simple='false'."
+            )
+
+    # Physics.
+
+    def step(self, nstep: int) -> None:
+        self._batch.step(nstep=nstep)
+
+    def forward(self, env_ids: torch.Tensor | None) -> None:
+        self._batch.forward(_as_ids(env_ids))
+
+    def reset(self, env_ids: torch.Tensor | None) -> None:
+        # Written through the bound copies and not with Batch.reset, which would keep writes that
+        # are still pending (an action sent to an environment that now starts over) and would
+        # recompute derived fields that terms still read.
+        rows: Any = slice(None) if env_ids is None else env_ids
+        for name in _ZERO_ON_RESET:
+            if name in self._tensors:
+                self._tensors[name][rows] = 0
+        qpos0 = self._model_tensors.get("qpos0")
+        self._tensors["qpos"][rows] = self._qpos0 if qpos0 is None else qpos0[rows]
+        if "eq_active" in self._tensors:
+            self._tensors["eq_active"][rows] = self._eq_active0
+        for name, source in (("mocap_pos", "body_pos"), ("mocap_quat", "body_quat")):
+            if name in self._tensors:
+                self._tensors[name][rows] = self._mocap_default(source, rows)
+
+    def _mocap_default(self, field: str, rows: Any) -> torch.Tensor:
+        order = torch.from_numpy(self._model.body_mocapid[self._mocap_body.numpy()]).argsort()
+        bodies = self._mocap_body[order]
+        if field in self._model_tensors:
+            return self._model_tensors[field][rows][:, bodies]
+        return torch.from_numpy(getattr(self._model, field)[bodies.numpy()].astype(np.float32))
+
+    def constants_written_by(self, level: int) -> tuple[str, ...]:
+        if level == 0:
+            return ()
+        return tuple(name for name in _DERIVED_CONSTANTS if getattr(self._model, name).size)
+
+    def recompute_constants(self, level: int, env_ids: torch.Tensor | None) -> None:
+        # mj_setConst does both parts at once; the part not asked for comes out as it was.
+        self.expand(self.constants_written_by(level))
+        self._batch.set_const(_as_ids(env_ids))
+
+    # Queries.
+
+    def raycast(
+        self,
+        origins: torch.Tensor,
+        directions: torch.Tensor,
+        geom_groups: tuple[int, ...] | None,
+        exclude_body_ids: torch.Tensor | None,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        shape = origins.shape[:2]
+        distances = np.empty(shape, dtype=np.float32)
+        normals = np.empty((*shape, 3), dtype=np.float32)
+        geom_ids = np.empty(shape, dtype=np.int32)
+        mask = None
+        if geom_groups is not None:
+            mask = np.zeros(6, dtype=np.uint8)
+            mask[list(geom_groups)] = 1
+        self._batch.rays(
+            np.ascontiguousarray(origins.numpy()),
+            np.ascontiguousarray(directions.numpy()),
+            distances,
+            geom_ids,
+            normals,
+            geomgroup=mask,
+            bodyexclude=None if exclude_body_ids is None else exclude_body_ids.numpy(),
+        )
+        return (
+            torch.from_numpy(distances),
+            torch.from_numpy(normals),
+            torch.from_numpy(geom_ids),
+        )
+
+    def jacobian(
+        self, points: torch.Tensor, body_ids: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        shape = (self.num_envs, 3, self._model.nv)
+        translational = np.empty(shape, dtype=np.float32)
+        rotational = np.empty(shape, dtype=np.float32)
+        self._batch.jac(
+            translational,
+            rotational,
+            np.ascontiguousarray(points.numpy()),
+            np.ascontiguousarray(body_ids.numpy().astype(np.int32)),
+        )
+        return torch.from_numpy(translational), torch.from_numpy(rotational)
+
+    # Copies.
+
+    def copy_to_host(self, env_idx: int, mj_data: mujoco.MjData) -> None:
+        state = self._batch.bind("state")[env_idx]
+        mujoco.mj_setState(
+            self._model, mj_data, state, int(mujoco.mjtState.mjSTATE_INTEGRATION)
+        )
+        # Values written since the last call are not in the state row yet.
+        for name in _INPUT_FIELDS & self._arrays.keys():
+            value = self._arrays[name][env_idx]
+            if name == "time":
+                mj_data.time = float(value)
+            else:
+                getattr(mj_data, name)[:] = value
+
+    def state_dict(self) -> dict[str, Any]:
+        # A call consumes the writes that are still pending, so that the rows hold everything.
+        self._batch.forward()
+        return {
+            "state": torch.from_numpy(self._batch.bind("state").copy()),
+            "bound": sorted(self._arrays),
+            "model": {name: value.clone() for name, value in self._model_tensors.items()},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        rows = self._batch.bind("state")
+        saved = state["state"].numpy()
+        if saved.shape != rows.shape:
+            raise ValueError(
+                f"The saved simulation has {saved.shape[0]} environments with {saved.shape[1]} "
+                f"state values each; this one has {rows.shape[0]} with {rows.shape[1]}."
+            )
+        # A call consumes the writes that are still pending here, so that none lands on the rows.
+        self._batch.forward()
+        # Fields that were bound are bound again, because a field that is bound in the middle of
+        # a step reads values that are one substep newer than they would have been.
+        for name in state["bound"]:
+            if name not in self._tensors:
+                self._bind(name)
+        self.expand(tuple(state["model"]))
+        for name, value in state["model"].items():
+            self._model_tensors[name].copy_(value)
+        rows[:] = saved
+        self._batch.forward()
+        # The forward pass has set the solver's warm start anew; put back the saved one.
+        rows[:] = saved
+
+
+def _as_float32(request: Any, name: str, struct: str) -> np.ndarray[Any, Any]:
+    """Bind or expand a field as float32 where it is real, and as its own type where it is not."""
+    owner = mujoco.MjData if struct == "MjData" else mujoco.MjModel
+    if name.startswith("_"):
+        raise AttributeError(f"{struct} has no field {name!r}.")
+    try:
+        return request(name, np.float32)
+    except (TypeError, ValueError, RuntimeError) as error:
+        try:
+            return request(name)
+        except (TypeError, ValueError, RuntimeError):
+            known = [field for field in dir(owner) if not field.startswith("_")]
+            close = difflib.get_close_matches(name, known, n=3)
+            hint = f" Close names: {', '.join(close)}." if close else ""
+            kind = AttributeError if struct == "MjData" else ValueError
+            raise kind(
+                f"The native engine has no per-environment {struct} field {name!r} ({error}).{hint}"
+            ) from error
+
+
+def _as_tensor(name: str, array: np.ndarray[Any, Any]) -> torch.Tensor:
+    """View rotation matrices as (N, ..., 3, 3), and every other field as it is."""
+    tensor = torch.from_numpy(array)
+    return tensor.view(*array.shape[:-1], 3, 3) if name in ROTATION_MATRICES else tensor
+
+
+def _as_ids(env_ids: torch.Tensor | None) -> np.ndarray[Any, Any] | None:
+    return None if env_ids is None else np.ascontiguousarray(env_ids.numpy())
