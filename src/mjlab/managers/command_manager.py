@@ -1,0 +1,270 @@
+"""Commands: goals that are given to the policy and redrawn from time to time."""
+
+from __future__ import annotations
+
+import inspect
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from mjlab.managers.debug_vis import DebugVisSwitches
+from mjlab.managers.env_ids import as_ids, is_empty
+from mjlab.managers.manager_base import ManagerBase, ManagerTermBase
+from mjlab.managers.null_managers import NullCommandManager as NullCommandManager
+
+if TYPE_CHECKING:
+    import viser
+
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.viewer.debug_visualizer import DebugVisualizer
+
+
+@dataclass(kw_only=True)
+class CommandTermCfg(ABC):
+    """A command; subclasses say in `build` which term it makes."""
+
+    resampling_time_range: tuple[float, float]
+    """Shortest and longest time until the command is redrawn, in seconds."""
+
+    debug_vis: bool = False
+    """Whether the command draws in viewers."""
+
+    @abstractmethod
+    def build(self, env: ManagerBasedRlEnv) -> CommandTerm:
+        """Return the term."""
+
+
+class CommandTerm(ManagerTermBase):
+    """Base of commands.
+
+    A subclass defines the property `command`, `_resample_command(env_ids)`, which draws commands
+    for some environments, and, where needed, `_update_command(env_ids)`, called every step (with
+    None: all) and after resets, `_update_metrics()`, which updates the tensors in `self.metrics`
+    for all environments, and `_debug_vis_impl(visualizer)`.
+
+    Attributes:
+        time_left: Seconds until the next command, (num_envs,).
+        command_counter: Number of commands in this episode, (num_envs,) int64.
+        metrics: Name to values (num_envs,); their means are logged at resets, then zeroed.
+
+    Raises `TypeError` if `_update_command` takes no `env_ids`, and `ValueError` if the config's
+    time range is not increasing.
+    """
+
+    def __init__(self, cfg: CommandTermCfg, env: ManagerBasedRlEnv) -> None:
+        super().__init__(env)
+        self.cfg = cfg
+        self._check()
+        self.metrics: dict[str, torch.Tensor] = {}
+        self.time_left = torch.zeros(self.num_envs, device=self.device)
+        self.command_counter = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+
+    @property
+    def command(self) -> Any:
+        """The current command, (num_envs, ...)."""
+        raise NotImplementedError(f"{self.name} must define the property command.")
+
+    def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
+        """Advance time, redraw commands whose time is over, and update.
+
+        Args:
+            dt: Seconds passed: one number, or (num_envs,) if `env_ids` is None.
+            env_ids: Environments to advance; the others keep time, command and metrics. None: all.
+
+        Raises `ValueError` for a `dt` of several numbers together with `env_ids`.
+        """
+        if env_ids is None:
+            self._update_metrics()
+            self.time_left -= dt
+            due = (self.time_left <= 0.0).nonzero().flatten()
+        else:
+            if isinstance(dt, torch.Tensor) and dt.numel() != 1:
+                raise ValueError(
+                    f"{self.name}.compute: with env_ids, dt must be one number, got shape "
+                    f"{tuple(dt.shape)}."
+                )
+            self._update_metrics_of(env_ids)
+            self.time_left[env_ids] -= dt
+            due = env_ids[self.time_left[env_ids] <= 0.0]
+        if len(due) > 0:
+            self._resample(due)
+        self._update_command(env_ids)
+
+    def reset(self, env_ids: torch.Tensor | slice | None) -> dict[str, float]:
+        """Draw new commands in these environments, and return and zero the mean of each metric."""
+        ids = as_ids(env_ids, self.num_envs, self.device)
+        if is_empty(ids):
+            return {}
+        log: dict[str, float] = {}
+        if self.metrics:
+            means = torch.stack([values[ids].float().mean() for values in self.metrics.values()])
+            log = dict(zip(self.metrics, means.tolist(), strict=True))
+            for values in self.metrics.values():
+                values[ids] = 0.0
+        self.command_counter[ids] = 0
+        self._resample(ids)
+        return log
+
+    def debug_vis(self, visualizer: DebugVisualizer) -> None:
+        """Draw the command if the config says so."""
+        if self.cfg.debug_vis:
+            self._debug_vis_impl(visualizer)
+
+    def create_gui(
+        self,
+        name: str,
+        server: viser.ViserServer,
+        get_env_idx: Callable[[], int],
+        on_change: Callable[[], None] | None = None,
+        request_action: Callable[[str, Any], None] | None = None,
+    ) -> None:
+        """Add the command's own controls to the browser viewer; none unless overridden."""
+
+    def on_viewer_pause(self, paused: bool) -> None:
+        """Hear that the viewer was paused or continued; does nothing unless overridden."""
+
+    def apply_gui_reset(self, env_ids: torch.Tensor) -> bool:
+        """Write a state that the viewer asked for after a reset; return whether one was written."""
+        return False
+
+    def _resample(self, env_ids: torch.Tensor) -> None:
+        low, high = self.cfg.resampling_time_range
+        times = torch.rand(len(env_ids), device=self.device) * (high - low) + low
+        self.time_left[env_ids] = times
+        self._resample_command(env_ids)
+        self.command_counter[env_ids] += 1
+
+    def _resample_command(self, env_ids: torch.Tensor) -> None:
+        """Draw commands for these environments (1-D int64)."""
+        raise NotImplementedError(f"{self.name} must define _resample_command(env_ids).")
+
+    def _update_command(self, env_ids: torch.Tensor | None) -> None:
+        """Update commands that depend on the state; None means all environments."""
+
+    def _update_metrics(self) -> None:
+        """Update the tensors in `self.metrics`."""
+
+    def _debug_vis_impl(self, visualizer: DebugVisualizer) -> None:
+        """Draw the command."""
+
+    def _update_metrics_of(self, env_ids: torch.Tensor) -> None:
+        """Update the metrics of some environments only.
+
+        `_update_metrics` knows only all of them; one that accumulates would count a step that the
+        others have not made, so their values are put back.
+        """
+        before = {name: (values, values.clone()) for name, values in self.metrics.items()}
+        self._update_metrics()
+        for name, (values, kept) in before.items():
+            kept[env_ids] = self.metrics[name][env_ids]
+            # Also where the update put another tensor in place of the old one.
+            self.metrics[name] = values.copy_(kept)
+
+    def _check(self) -> None:
+        parameters = inspect.signature(self._update_command).parameters.values()
+        if not any(p.name == "env_ids" or p.kind is p.VAR_KEYWORD for p in parameters):
+            raise TypeError(
+                f"{self.name}._update_command must take env_ids: a tensor of the environments "
+                "to update after a reset, or None for all. Change it to "
+                "`def _update_command(self, env_ids: torch.Tensor | None) -> None`."
+            )
+        low, high = self.cfg.resampling_time_range
+        if low > high:
+            raise ValueError(
+                f"{self.name}: resampling_time_range is {(low, high)}, but the first number must "
+                "not be larger than the second."
+            )
+
+
+class CommandManager(DebugVisSwitches, ManagerBase):
+    """Holds the commands by name. The config is kept by reference and may be edited."""
+
+    def __init__(self, cfg: Mapping[str, CommandTermCfg | None], env: ManagerBasedRlEnv) -> None:
+        self.cfg = cfg
+        self._terms: dict[str, CommandTerm] = {}
+        super().__init__(env)
+
+    @property
+    def active_terms(self) -> list[str]:
+        """Names of the commands."""
+        return list(self._terms)
+
+    def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
+        """Advance all commands by `dt` seconds; see `CommandTerm.compute`."""
+        for term in self._terms.values():
+            term.compute(dt, env_ids)
+
+    def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
+        """Reset all commands in these environments and return `Metrics/<command>/<metric>`."""
+        ids = as_ids(env_ids, self.num_envs, self.device)
+        log: dict[str, Any] = {}
+        for name, term in self._terms.items():
+            log |= {f"Metrics/{name}/{key}": value for key, value in term.reset(ids).items()}
+        return log
+
+    def get_command(self, name: str) -> torch.Tensor:
+        """Return the current command; raises `KeyError`, with the valid names, if unknown."""
+        return self.get_term(name).command
+
+    def get_term(self, name: str) -> CommandTerm:
+        """Return a command's term; raises `KeyError`, with the valid names, if unknown."""
+        if name not in self._terms:
+            self._unknown(name, self.active_terms, KeyError)
+        return self._terms[name]
+
+    def get_term_cfg(self, name: str) -> CommandTermCfg:
+        """Return the live config of a command; raises `ValueError` if unknown."""
+        if name not in self._terms:
+            self._unknown(name, self.active_terms, ValueError)
+        return self._terms[name].cfg
+
+    def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
+        """Return, for one environment, the values of each command."""
+        return [
+            (name, term.command[env_idx].flatten().tolist()) for name, term in self._terms.items()
+        ]
+
+    def get_visualizable_terms(self) -> list[tuple[str, CommandTerm]]:
+        """Return the commands that draw, as (name, term)."""
+        return [(name, term) for name, term in self._terms.items() if term.cfg.debug_vis]
+
+    def create_gui(
+        self,
+        server: viser.ViserServer,
+        get_env_idx: Callable[[], int],
+        on_change: Callable[[], None] | None = None,
+        request_action: Callable[[str, Any], None] | None = None,
+    ) -> None:
+        """Let every command add its own controls to the browser viewer."""
+        for name, term in self._terms.items():
+            term.create_gui(name, server, get_env_idx, on_change, request_action)
+
+    def on_viewer_pause(self, paused: bool) -> None:
+        """Tell all commands that the viewer was paused or continued."""
+        for term in self._terms.values():
+            term.on_viewer_pause(paused)
+
+    def apply_gui_reset(self, env_ids: torch.Tensor) -> bool:
+        """Ask all commands for a state to write after a reset; return whether one wrote it."""
+        wrote = [term.apply_gui_reset(env_ids) for term in self._terms.values()]
+        return any(wrote)
+
+    def _prepare_terms(self) -> None:
+        for name, term_cfg in self._enabled(self.cfg, CommandTermCfg):
+            term = term_cfg.build(self._env)
+            if not isinstance(term, CommandTerm):
+                raise TypeError(
+                    f"{self._label(name)}: {type(term_cfg).__name__}.build must return a "
+                    f"CommandTerm, got {type(term).__name__}."
+                )
+            self._terms[name] = term
+
+    def _live_cfgs(self) -> dict[str, Any]:
+        return {name: term.cfg for name, term in self._terms.items()}
+
+    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
+        rows = [(name, type(term).__name__) for name, term in self._terms.items()]
+        return ["name", "type"], rows

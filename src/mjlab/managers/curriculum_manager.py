@@ -1,0 +1,69 @@
+"""Curriculum: terms that change the task as training proceeds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from mjlab.managers.env_ids import as_index
+from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
+from mjlab.managers.null_managers import NullCurriculumManager as NullCurriculumManager
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+
+
+@dataclass(kw_only=True)
+class CurriculumTermCfg(ManagerTermBaseCfg):
+    """A curriculum term: `func(env, env_ids, **params)` is called when environments reset.
+
+    It returns what to log: None, a number, a tensor with one element, or a dict of those.
+    """
+
+
+class CurriculumManager(TermListManager):
+    """Calls its terms at every reset, before anything of the old episode is lost."""
+
+    _cfg_type = CurriculumTermCfg
+    _leading = ("env", "env_ids")
+
+    def __init__(self, cfg: Mapping[str, CurriculumTermCfg | None], env: ManagerBasedRlEnv) -> None:
+        super().__init__(cfg, env)
+        self._state: dict[str, Any] = dict.fromkeys(self._term_names)
+
+    def compute(self, env_ids: torch.Tensor | slice | None = None) -> None:
+        """Call all terms for the environments that are about to reset, and keep their results."""
+        index = as_index(env_ids)
+        for name, cfg in zip(self._term_names, self._term_cfgs, strict=True):
+            self._state[name] = cfg.func(self._env, index, **cfg.params)
+
+    def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, float]:
+        """Return `Curriculum/<term>` or `Curriculum/<term>/<key>`, and reset the terms."""
+        log: dict[str, float] = {}
+        for name, state in self._state.items():
+            if isinstance(state, dict):
+                items = {f"{name}/{key}": value for key, value in state.items()}
+            else:
+                items = {name: state}
+            log |= {
+                f"Curriculum/{key}": _number(value)
+                for key, value in items.items()
+                if value is not None
+            }
+        self._reset_class_terms(env_ids)
+        return log
+
+    def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
+        """Return the last results of each term; they are the same for all environments."""
+        terms = []
+        for name, state in self._state.items():
+            values = list(state.values()) if isinstance(state, dict) else [state]
+            terms.append((name, [float(_number(v)) for v in values if v is not None]))
+        return terms
+
+
+def _number(value: Any) -> Any:
+    return value.item() if isinstance(value, torch.Tensor) else value

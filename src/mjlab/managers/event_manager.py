@@ -1,0 +1,234 @@
+"""Events: changes of the state or the model at start-up, at resets, at intervals or every step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import torch
+
+from mjlab.compat import accepts_older_fields
+from mjlab.managers.debug_vis import DebugVisSwitches
+from mjlab.managers.env_ids import as_ids, is_empty
+from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
+from mjlab.managers.model_fields import RecomputeLevel as RecomputeLevel
+from mjlab.managers.model_fields import (
+    declared_model_fields,
+    declared_recompute,
+    join_levels,
+)
+from mjlab.managers.model_fields import requires_model_fields as requires_model_fields
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+
+EventMode = Literal["startup", "reset", "interval", "step"]
+
+# Timers count down in steps, so that rounding must not put an event off by one.
+_TIMER_TOLERANCE = 1e-6
+# Far enough back that an environment which never fired is always due.
+_NEVER = -(2**40)
+
+
+@accepts_older_fields
+@dataclass(kw_only=True)
+class EventTermCfg(ManagerTermBaseCfg):
+    """An event: `func(env, env_ids, **params)`, where `env_ids` is None for all environments."""
+
+    mode: EventMode
+    """When it happens: once at "startup", at each "reset", at an "interval", or every "step"."""
+
+    interval_range_s: tuple[float, float] | None = None
+    """Shortest and longest time between two events of mode "interval", in seconds."""
+
+    is_global_time: bool = False
+    """Mode "interval": True has one timer for all environments, which resets do not touch."""
+
+    min_step_count_between_reset: int = 0
+    """Mode "reset": environment steps that must have passed since the event last happened in an
+    environment; 0 means at every reset."""
+
+
+class EventManager(DebugVisSwitches, TermListManager):
+    """Calls events at their time, and recomputes constants of the model that they changed.
+
+    Raises `ValueError` for an unknown mode, and for mode "interval" without a valid
+    `interval_range_s`.
+    """
+
+    _cfg_type = EventTermCfg
+    _leading = ("env", "env_ids")
+    _transient = {"_terms_by_mode"}
+
+    def __init__(self, cfg: Mapping[str, EventTermCfg | None], env: ManagerBasedRlEnv) -> None:
+        super().__init__(cfg, env)
+        self._terms_by_mode: dict[str, list[tuple[str, EventTermCfg]]] = {}
+        # Seconds left: a tensor (num_envs,), or a number for a global timer.
+        self._timers: dict[str, torch.Tensor | float] = {}
+        # Environment step at which the event last happened, (num_envs,) int64.
+        self._last_reset_step: dict[str, torch.Tensor] = {}
+        for name, term in zip(self._term_names, self._term_cfgs, strict=True):
+            self._terms_by_mode.setdefault(term.mode, []).append((name, term))
+            self._prepare_time(name, term)
+
+    @property
+    def active_terms(self) -> dict[str, list[str]]:  # ty: ignore[incompatible-property-override]
+        """Names of the events of each mode that has any."""
+        return {mode: [name for name, _ in terms] for mode, terms in self._terms_by_mode.items()}
+
+    @property
+    def available_modes(self) -> list[str]:
+        """Modes that have events."""
+        return list(self._terms_by_mode)
+
+    @property
+    def domain_randomization_fields(self) -> tuple[str, ...]:
+        """Model fields that need a value for each environment, without repetition."""
+        fields = (
+            field
+            for cfg in self._term_cfgs
+            for field in declared_model_fields(cfg.func, cfg.params)
+        )
+        return tuple(dict.fromkeys(fields))
+
+    def apply(
+        self,
+        mode: EventMode,
+        env_ids: torch.Tensor | slice | None = None,
+        dt: float | None = None,
+        global_env_step_count: int | None = None,
+    ) -> None:
+        """Let the events of a mode happen where they are due, then recompute what they changed.
+
+        Args:
+            mode: One of "startup", "reset", "interval" and "step".
+            env_ids: Environments that reset; required for "reset", refused for "interval".
+            dt: Seconds since the last call; required for "interval" and "step".
+            global_env_step_count: Environment steps since the start; required for "reset".
+
+        Raises `ValueError` if an argument is missing or out of place, or the mode is unknown.
+        """
+        _check_arguments(mode, env_ids, dt, global_env_step_count)
+        levels = []
+        for name, cfg in self._terms_by_mode.get(mode, ()):
+            if mode == "interval":
+                fired = self._apply_interval(name, cfg, dt or 0.0)
+            elif mode == "reset":
+                fired = self._apply_reset(name, cfg, env_ids, global_env_step_count or 0)
+            else:
+                cfg.func(self._env, env_ids, **cfg.params)
+                fired = True
+            if fired:
+                levels.append(declared_recompute(cfg.func, cfg.params))
+        level = join_levels(levels)
+        if level != RecomputeLevel.none:
+            self._env.sim.recompute_constants(level)
+
+    def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
+        """Reset terms of all modes and redraw the timers of these environments; logs nothing."""
+        self._reset_class_terms(env_ids)
+        if self._timers and not is_empty(env_ids):
+            ids = as_ids(env_ids, self.num_envs, self.device)
+            for name, cfg in self._terms_by_mode["interval"]:
+                timer = self._timers[name]
+                if isinstance(timer, torch.Tensor):
+                    timer[ids] = self._draw(cfg, len(ids))
+        return {}
+
+    def get_visualizable_terms(self) -> list[tuple[str, Any]]:
+        """Return the events that can draw, as (name, function object)."""
+        terms = zip(self._term_names, self._term_cfgs, strict=True)
+        return [
+            (name, cfg.func)
+            for name, cfg in terms
+            if callable(getattr(cfg.func, "debug_vis", None))
+        ]
+
+    def _apply_interval(self, name: str, cfg: EventTermCfg, dt: float) -> bool:
+        timer = self._timers[name]
+        if not isinstance(timer, torch.Tensor):
+            timer -= dt
+            due = timer < _TIMER_TOLERANCE
+            self._timers[name] = self._draw(cfg, 1).item() if due else timer
+            if due:
+                cfg.func(self._env, None, **cfg.params)
+            return due
+        timer.sub_(dt)
+        ids = (timer < _TIMER_TOLERANCE).nonzero().flatten()
+        if len(ids) == 0:
+            return False
+        timer[ids] = self._draw(cfg, len(ids))
+        cfg.func(self._env, ids, **cfg.params)
+        return True
+
+    def _apply_reset(
+        self, name: str, cfg: EventTermCfg, env_ids: torch.Tensor | slice | None, step: int
+    ) -> bool:
+        ids = as_ids(env_ids, self.num_envs, self.device)
+        last = self._last_reset_step[name]
+        if cfg.min_step_count_between_reset > 0:
+            ids = ids[step - last[ids] >= cfg.min_step_count_between_reset]
+        if len(ids) == 0:
+            return False
+        last[ids] = step
+        cfg.func(self._env, ids, **cfg.params)
+        return True
+
+    def _prepare_terms(self) -> None:
+        for name, cfg in self.cfg.items():
+            if isinstance(cfg, EventTermCfg) and cfg.mode not in get_args(EventMode):
+                raise ValueError(
+                    f"{self._label(name)}: mode is {cfg.mode!r}, but must be one of "
+                    f"{get_args(EventMode)}."
+                )
+        super()._prepare_terms()
+
+    def _prepare_time(self, name: str, cfg: EventTermCfg) -> None:
+        if cfg.mode == "reset":
+            self._last_reset_step[name] = torch.full(
+                (self.num_envs,), _NEVER, dtype=torch.long, device=self.device
+            )
+        if cfg.mode != "interval":
+            return
+        bounds = cfg.interval_range_s
+        if bounds is None or bounds[0] > bounds[1]:
+            raise ValueError(
+                f"{self._label(name)}: mode 'interval' needs interval_range_s=(shortest, longest) "
+                f"in seconds, got {bounds!r}."
+            )
+        self._timers[name] = (
+            self._draw(cfg, 1).item() if cfg.is_global_time else self._draw(cfg, self.num_envs)
+        )
+
+    def _draw(self, cfg: EventTermCfg, count: int) -> torch.Tensor:
+        low, high = cfg.interval_range_s or (0.0, 0.0)
+        return torch.rand(count, device=self.device) * (high - low) + low
+
+    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
+        terms = zip(self._term_names, self._term_cfgs, strict=True)
+        rows = [(cfg.mode, name, cfg.interval_range_s or "") for name, cfg in terms]
+        return ["mode", "name", "interval (s)"], rows
+
+
+def _check_arguments(
+    mode: str,
+    env_ids: torch.Tensor | slice | None,
+    dt: float | None,
+    global_env_step_count: int | None,
+) -> None:
+    """Raise `ValueError` for arguments of `EventManager.apply` that do not fit the mode."""
+    if mode not in get_args(EventMode):
+        raise ValueError(f"Event mode {mode!r} does not exist; modes: {get_args(EventMode)}.")
+    if mode in ("interval", "step") and dt is None:
+        raise ValueError(f"Events of mode {mode!r} need dt, the seconds since the last call.")
+    if mode == "interval" and env_ids is not None:
+        raise ValueError(
+            "Events of mode 'interval' take no env_ids: each environment has its timer."
+        )
+    if mode == "reset" and env_ids is None:
+        raise ValueError("Events of mode 'reset' need env_ids, the environments that reset.")
+    if mode == "reset" and global_env_step_count is None:
+        raise ValueError(
+            "Events of mode 'reset' need global_env_step_count, the environment steps so far."
+        )

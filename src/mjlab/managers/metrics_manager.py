@@ -1,0 +1,143 @@
+"""Metrics: numbers to log for each episode that are no rewards."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+
+from mjlab.managers.env_ids import as_index, is_empty
+from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
+from mjlab.managers.null_managers import NullMetricsManager as NullMetricsManager
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+
+REDUCE_OPTIONS = ("last", "max", "mean", "sum")
+
+
+@dataclass(kw_only=True)
+class MetricsTermCfg(ManagerTermBaseCfg):
+    """A metric: `func(env, **params)` returns one number for each environment."""
+
+    per_substep: bool = False
+    """True evaluates it after every physics substep; the value of a step is then their mean."""
+
+    reduce: Literal["last", "max", "mean", "sum"] = "mean"
+    """How the values of an episode's steps become one."""
+
+
+class MetricsManager(TermListManager):
+    """Collects the metrics of each episode. Values are neither weighted nor cleaned of NaN.
+
+    Raises `ValueError` for an unknown `reduce`.
+    """
+
+    _cfg_type = MetricsTermCfg
+    _transient = {"_rows", "_substep_rows", "_terms_by_reduce"}
+
+    def __init__(self, cfg: Mapping[str, MetricsTermCfg | None], env: ManagerBasedRlEnv) -> None:
+        super().__init__(cfg, env)
+        size = (len(self._term_names), self.num_envs)
+        self._last = torch.zeros(size, device=self.device)
+        self._sum = torch.zeros(size, device=self.device)
+        self._max = torch.full(size, -torch.inf, device=self.device)
+        self._steps = torch.zeros(self.num_envs, device=self.device)
+        self._rows = list(self._last)
+        substep_terms = [k for k, c in enumerate(self._term_cfgs) if c.per_substep]
+        self._substep_sums = torch.zeros(len(substep_terms), self.num_envs, device=self.device)
+        self._substep_rows = dict(zip(substep_terms, self._substep_sums, strict=True))
+        self._substeps = 0
+        self._terms_by_reduce = self._group_by_reduce()
+
+    @property
+    def needs_substep(self) -> bool:
+        """Whether `compute_substep` must be called after every physics substep."""
+        return bool(self._substep_rows)
+
+    def compute_substep(self) -> None:
+        """Evaluate the terms that are `per_substep`, after a physics substep."""
+        if not self._substep_rows:
+            return
+        self._substeps += 1
+        for k, row in self._substep_rows.items():
+            row.add_(self._evaluate(k))
+
+    def compute(self) -> None:
+        """Evaluate the other terms and take up the step, after rewards.
+
+        Raises `ValueError` if a term returns another shape than (num_envs,).
+        """
+        for k, row in enumerate(self._rows):
+            if k in self._substep_rows:
+                torch.div(self._substep_rows[k], max(self._substeps, 1), out=row)
+            else:
+                row.copy_(self._evaluate(k))
+        if self._substep_rows:
+            self._substep_sums.zero_()
+            self._substeps = 0
+        self._sum.add_(self._last)
+        if "max" in self._terms_by_reduce:
+            torch.maximum(self._max, self._last, out=self._max)
+        self._steps.add_(1.0)
+
+    def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, torch.Tensor]:
+        """Return `Episode_Metrics/<term>`, the mean over these environments, and start anew.
+
+        Environments without a step have no maximum and are left out of its mean, which is 0 if
+        there is no other.
+        """
+        self._reset_class_terms(env_ids)
+        if is_empty(env_ids) or not self._term_names:
+            return {}
+        index = as_index(env_ids)
+        values: dict[int, torch.Tensor] = {}
+        for reduce, terms in self._terms_by_reduce.items():
+            means = self._episode_means(reduce, index)
+            values |= {k: means[k] for k in terms}
+        self._sum[:, index] = 0.0
+        self._max[:, index] = -torch.inf
+        self._steps[index] = 0.0
+        return {f"Episode_Metrics/{name}": values[k] for k, name in enumerate(self._term_names)}
+
+    def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
+        """Return, for one environment, the value of each term in the last step."""
+        values = self._last[:, env_idx].tolist()
+        return [(name, [value]) for name, value in zip(self._term_names, values, strict=True)]
+
+    def _evaluate(self, k: int) -> torch.Tensor:
+        cfg = self._term_cfgs[k]
+        value = cfg.func(self._env, **cfg.params)
+        self._check_value(self._term_names[k], value)
+        return value
+
+    def _episode_means(self, reduce: str, index: torch.Tensor | slice) -> torch.Tensor:
+        """Return the mean over environments of every term (terms,), reduced in this way."""
+        steps = self._steps[index]
+        if reduce == "mean":
+            return (self._sum[:, index] / steps.clamp(min=1.0)).mean(dim=1)
+        if reduce == "sum":
+            return self._sum[:, index].mean(dim=1)
+        if reduce == "last":
+            return self._last[:, index].mean(dim=1)
+        stepped = steps > 0.0
+        maxima = torch.where(stepped, self._max[:, index], 0.0)
+        return maxima.sum(dim=1) / stepped.sum().clamp(min=1)
+
+    def _group_by_reduce(self) -> dict[str, list[int]]:
+        groups: dict[str, list[int]] = {}
+        for k, (name, cfg) in enumerate(zip(self._term_names, self._term_cfgs, strict=True)):
+            if cfg.reduce not in REDUCE_OPTIONS:
+                raise ValueError(
+                    f"{self._label(name)}: reduce is {cfg.reduce!r}, but must be one of "
+                    f"{REDUCE_OPTIONS}."
+                )
+            groups.setdefault(cfg.reduce, []).append(k)
+        return groups
+
+    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
+        terms = zip(self._term_names, self._term_cfgs, strict=True)
+        rows = [(name, cfg.reduce, cfg.per_substep) for name, cfg in terms]
+        return ["name", "reduce", "per substep"], rows

@@ -1,0 +1,117 @@
+"""Rewards: a weighted sum of terms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from mjlab.managers.debug_vis import DebugVisSwitches
+from mjlab.managers.env_ids import as_index, is_empty
+from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+
+
+@dataclass(kw_only=True)
+class RewardTermCfg(ManagerTermBaseCfg):
+    """A reward term: `func(env, **params)` returns one number for each environment."""
+
+    weight: float
+    """Factor of the term in the sum. With 0 the function is not called at all."""
+
+
+class RewardManager(DebugVisSwitches, TermListManager):
+    """Sums the weighted terms of a step, and of each episode.
+
+    Args:
+        cfg: Terms by name.
+        env: The environment.
+        scale_by_dt: Whether rewards are multiplied by the duration of a step, so that weights are
+            rates per second.
+    """
+
+    _cfg_type = RewardTermCfg
+    # Views of `_rates`.
+    _transient = {"_step_reward", "_rows", "_scale_by_dt"}
+
+    def __init__(
+        self,
+        cfg: Mapping[str, RewardTermCfg | None],
+        env: ManagerBasedRlEnv,
+        *,
+        scale_by_dt: bool = True,
+    ) -> None:
+        self._scale_by_dt = scale_by_dt
+        super().__init__(cfg, env)
+        size = (len(self._term_names), self.num_envs)
+        # Terms first, so that each term writes to memory without gaps.
+        self._rates = torch.zeros(size, device=self.device)
+        self._episode_sums = torch.zeros(size, device=self.device)
+        self._reward_buf = torch.zeros(self.num_envs, device=self.device)
+        self._rows = list(self._rates)
+        # Weighted rates (num_envs, terms) of the last step, not multiplied by its duration.
+        self._step_reward = self._rates.t()
+
+    def compute(self, dt: float) -> torch.Tensor:
+        """Return the reward (num_envs,) of a step of `dt` seconds, in a buffer used every step.
+
+        A term that is NaN or infinite in an environment counts as 0 there. Raises `ValueError`
+        if a term returns another shape than (num_envs,).
+        """
+        for name, cfg, row in zip(self._term_names, self._term_cfgs, self._rows, strict=True):
+            if cfg.weight == 0.0:
+                row.zero_()
+                continue
+            value = cfg.func(self._env, **cfg.params)
+            self._check_value(name, value)
+            torch.mul(value, cfg.weight, out=row)
+        torch.nan_to_num_(self._rates, nan=0.0, posinf=0.0, neginf=0.0)
+        scale = dt if self._scale_by_dt else 1.0
+        self._episode_sums.add_(self._rates, alpha=scale)
+        # One after the other: the sum then has the same bits for any number of threads.
+        self._reward_buf.zero_()
+        for row in self._rows:
+            self._reward_buf.add_(row, alpha=scale)
+        return self._reward_buf
+
+    def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, torch.Tensor]:
+        """Return `Episode_Reward/<term>`, and zero the sums of these environments.
+
+        It is the mean over the environments of a term's sum, divided by the maximum episode length
+        in seconds (not divided if episodes have no length).
+        """
+        self._reset_class_terms(env_ids)
+        if is_empty(env_ids) or not self._term_names:
+            return {}
+        index = as_index(env_ids)
+        duration = self._env.max_episode_length_s
+        means = self._episode_sums[:, index].mean(dim=1)
+        if duration > 0.0:
+            means /= duration
+        self._episode_sums[:, index] = 0.0
+        return {
+            f"Episode_Reward/{name}": mean
+            for name, mean in zip(self._term_names, means, strict=True)
+        }
+
+    def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
+        """Return, for one environment, the weighted rate of each term in the last step."""
+        rates = self._step_reward[env_idx].tolist()
+        return [(name, [rate]) for name, rate in zip(self._term_names, rates, strict=True)]
+
+    def get_visualizable_terms(self) -> list[tuple[str, Any]]:
+        """Return the terms that can draw, as (name, function object)."""
+        terms = zip(self._term_names, self._term_cfgs, strict=True)
+        return [
+            (name, cfg.func)
+            for name, cfg in terms
+            if callable(getattr(cfg.func, "debug_vis", None))
+        ]
+
+    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
+        terms = zip(self._term_names, self._term_cfgs, strict=True)
+        return ["name", "weight"], [(name, cfg.weight) for name, cfg in terms]

@@ -1,0 +1,101 @@
+"""Terminations: when episodes end, and whether by failure or by running out of time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from mjlab.managers.env_ids import as_index, is_empty
+from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+
+
+@dataclass(kw_only=True)
+class TerminationTermCfg(ManagerTermBaseCfg):
+    """A reason to end an episode: `func(env, **params)` returns one bool for each environment."""
+
+    time_out: bool = False
+    """True if the episode is cut off rather than over, so that learning counts on what would have
+    followed."""
+
+
+class TerminationManager(TermListManager):
+    """Decides which episodes end. All results are buffers that the next step overwrites."""
+
+    _cfg_type = TerminationTermCfg
+    _transient = {"_rows"}
+
+    def __init__(
+        self, cfg: Mapping[str, TerminationTermCfg | None], env: ManagerBasedRlEnv
+    ) -> None:
+        super().__init__(cfg, env)
+
+        def falses(*size: int) -> torch.Tensor:
+            return torch.zeros(*size, self.num_envs, dtype=torch.bool, device=self.device)
+
+        self._values = falses(len(self._term_names))
+        self._rows = list(self._values)
+        self._terminated, self._time_outs, self._dones = falses(), falses(), falses()
+
+    @property
+    def dones(self) -> torch.Tensor:
+        """Whether the episode ended for any reason, (num_envs,) bool."""
+        return self._dones
+
+    @property
+    def terminated(self) -> torch.Tensor:
+        """Whether a term that is no time-out ended the episode, (num_envs,) bool."""
+        return self._terminated
+
+    @property
+    def time_outs(self) -> torch.Tensor:
+        """Whether a time-out ended the episode, (num_envs,) bool; `terminated` may be true too."""
+        return self._time_outs
+
+    def compute(self) -> torch.Tensor:
+        """Evaluate all terms and return `dones`.
+
+        Raises `ValueError` if a term returns another shape than (num_envs,).
+        """
+        self._terminated.zero_()
+        self._time_outs.zero_()
+        for name, cfg, row in zip(self._term_names, self._term_cfgs, self._rows, strict=True):
+            value = cfg.func(self._env, **cfg.params)
+            self._check_value(name, value)
+            row.copy_(value)
+            (self._time_outs if cfg.time_out else self._terminated).logical_or_(row)
+        return torch.logical_or(self._terminated, self._time_outs, out=self._dones)
+
+    def get_term(self, name: str) -> torch.Tensor:
+        """Return the last value of a term, (num_envs,) bool.
+
+        Raises `KeyError`, with the valid names, if there is no such term.
+        """
+        if name not in self._term_names:
+            self._unknown(name, self._term_names, KeyError)
+        return self._rows[self._term_names.index(name)]
+
+    def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
+        """Return `Episode_Termination/<term>`: in how many of these environments it was true."""
+        self._reset_class_terms(env_ids)
+        if is_empty(env_ids) or not self._term_names:
+            return {}
+        counts = self._values[:, as_index(env_ids)].sum(dim=1).tolist()
+        return {
+            f"Episode_Termination/{name}": count
+            for name, count in zip(self._term_names, counts, strict=True)
+        }
+
+    def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
+        """Return, for one environment, 1 for each term that was true in the last step, else 0."""
+        values = self._values[:, env_idx].tolist()
+        return [(name, [float(v)]) for name, v in zip(self._term_names, values, strict=True)]
+
+    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
+        terms = zip(self._term_names, self._term_cfgs, strict=True)
+        return ["name", "time out"], [(name, cfg.time_out) for name, cfg in terms]

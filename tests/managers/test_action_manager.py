@@ -1,0 +1,226 @@
+"""Actions: split among terms, remembered, checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mjlab.managers import ActionManager, ActionTerm, ActionTermCfg
+from mjlab.managers.finite_action import DeferredCheck
+from mjlab.utils.substep import constant_within_step
+
+
+class Keep(ActionTerm):
+    """Keeps what it gets; applies nothing."""
+
+    def __init__(self, cfg, env):
+        super().__init__(cfg, env)
+        self._raw_actions = torch.zeros(env.num_envs, cfg.size)
+        self.applied = 0
+        self.resets = []
+
+    @property
+    def action_dim(self):
+        return self.cfg.size
+
+    @property
+    def raw_action(self):
+        return self._raw_actions
+
+    def process_actions(self, actions):
+        self._raw_actions[:] = actions
+
+    @constant_within_step
+    def apply_actions(self):
+        self.applied += 1
+
+    def reset(self, env_ids=None):
+        self.resets.append(env_ids)
+
+
+class KeepEverySubstep(Keep):
+    def apply_actions(self):
+        self.applied += 1
+
+
+@dataclass(kw_only=True)
+class KeepCfg(ActionTermCfg):
+    size: int
+    term: type = Keep
+
+    def build(self, env):
+        return self.term(self, env)
+
+
+def make(env, *sizes, **fields):
+    cfg = {
+        str(i): KeepCfg(entity_name="robot", size=size, **fields) for i, size in enumerate(sizes)
+    }
+    return ActionManager(cfg, env)
+
+
+def test_terms_get_their_parts_in_order(env):
+    manager = make(env, 2, 1, 3)
+    assert manager.active_terms == ["0", "1", "2"]
+    assert manager.action_term_dim == [2, 1, 3]
+    assert manager.total_action_dim == 6
+    action = torch.arange(24.0).reshape(4, 6)
+    manager.process_action(action)
+    parts = [manager.get_term(name).raw_action for name in manager.active_terms]
+    assert torch.equal(torch.cat(parts, dim=1), action)
+    assert manager.get_active_iterable_terms(1) == [
+        ("0", [6.0, 7.0]),
+        ("1", [8.0]),
+        ("2", [9.0, 10.0, 11.0]),
+    ]
+
+
+@given(
+    actions=st.lists(
+        st.lists(st.floats(-5.0, 5.0, width=32), min_size=8, max_size=8), min_size=1, max_size=6
+    ),
+    reset_after=st.integers(0, 5),
+)
+@settings(deadline=None, max_examples=40)
+def test_the_last_three_actions_are_remembered_since_the_reset(make_env, actions, reset_after):
+    manager = make(make_env(), 2)
+    expected = [torch.zeros(4, 2)] * 3
+    for step, numbers in enumerate(actions):
+        action = torch.tensor(numbers).reshape(4, 2)
+        manager.process_action(action)
+        expected = [action.clone(), *expected[:2]]
+        if step == reset_after:
+            manager.reset(torch.tensor([2]))
+            for old in (expected := [old.clone() for old in expected]):
+                old[2] = 0.0
+    remembered = (manager.action, manager.prev_action, manager.prev_prev_action)
+    for got, wanted in zip(remembered, expected, strict=True):
+        assert torch.equal(got, wanted)
+
+
+def test_the_callers_action_is_neither_kept_nor_changed(env):
+    manager = make(env, 2)
+    action = torch.ones(4, 2)
+    manager.process_action(action)
+    action.zero_()
+    assert manager.action.tolist() == [[1.0, 1.0]] * 4
+    manager.reset(None)
+    assert manager.action.tolist() == [[0.0, 0.0]] * 4
+
+
+def test_every_term_is_applied_and_reset(env):
+    manager = make(env, 1, 1)
+    manager.apply_action()
+    ids = torch.tensor([3])
+    manager.reset(ids)
+    for name in manager.active_terms:
+        assert manager.get_term(name).applied == 1
+        assert manager.get_term(name).resets == [ids]
+
+
+@pytest.mark.parametrize("shape", [(4, 3), (3, 2), (2,), (1, 2)])
+def test_another_shape_is_refused_with_both_shapes(env, shape):
+    with pytest.raises(ValueError, match=rf"\({shape[0]},.*\(4, 2\)"):
+        make(env, 2).process_action(torch.zeros(shape))
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
+def test_actions_that_are_not_finite_name_environments_and_values(env, bad):
+    manager = make(env, 2)
+    manager.process_action(torch.ones(4, 2))
+    action = torch.ones(4, 2)
+    action[2, 1] = bad
+    with pytest.raises(ValueError, match=rf"1 of 4 .*env 2: \[1.0, {bad}\]"):
+        manager.process_action(action)
+    assert manager.action.tolist() == [[1.0, 1.0]] * 4, "nothing may have changed"
+    assert manager.prev_action.tolist() == [[0.0, 0.0]] * 4
+
+
+def test_only_the_first_ten_bad_environments_are_listed(make_env):
+    manager = make(make_env(num_envs=15), 1)
+    with pytest.raises(ValueError, match=r"env 9: \[nan\], and 2 more") as error:
+        manager.process_action(torch.tensor([[torch.nan]] * 12 + [[0.0]] * 3))
+    assert "env 10" not in str(error.value)
+
+
+def test_infinities_that_cancel_are_noticed(env):
+    action = torch.zeros(4, 2)
+    action[0, 0], action[1, 0] = torch.inf, -torch.inf
+    with pytest.raises(ValueError, match="2 of 4"):
+        make(env, 2).process_action(action)
+
+
+def test_large_finite_actions_are_accepted(env):
+    # Their sum overflows, which must not be taken for infinity.
+    make(env, 2).process_action(torch.full((4, 2), 3e38))
+
+
+class Copy:
+    """Stands for a CUDA event: tells whether the copy of the flag has arrived."""
+
+    arrived = True
+
+    def record(self):
+        pass
+
+    def query(self):
+        return self.arrived
+
+
+def test_on_a_gpu_a_bad_action_is_reported_by_a_later_step():
+    copy = Copy()
+    check = DeferredCheck(num_envs=4, action_dim=1, device="cpu", event=copy)
+    good, bad = torch.zeros(4, 1), torch.tensor([[0.0], [torch.nan], [0.0], [0.0]])
+    check(good)
+    check(bad)
+    with pytest.raises(ValueError, match=r"previous step.*1 of 4.*env 1: \[nan\]"):
+        check(good)
+    check(good)
+    check(good)
+
+
+def test_on_a_gpu_a_bad_action_is_not_forgotten_while_the_flag_travels():
+    copy = Copy()
+    check = DeferredCheck(num_envs=4, action_dim=1, device="cpu", event=copy)
+    copy.arrived = False
+    check(torch.zeros(4, 1))
+    check(torch.tensor([[0.0], [0.0], [torch.inf], [0.0]]))
+    check(torch.zeros(4, 1))
+    copy.arrived = True
+    check(torch.zeros(4, 1))
+    with pytest.raises(ValueError, match=r"env 2: \[inf\]"):
+        check(torch.zeros(4, 1))
+
+
+def test_substeps_are_needed_when_a_term_acts_in_them(env):
+    assert not make(env, 1, 1).needs_substep
+    assert make(env, 1, term=KeepEverySubstep).needs_substep
+    assert not make(env).needs_substep
+
+
+def test_unknown_terms_list_the_valid_names(env):
+    with pytest.raises(KeyError, match=r"'leg'.*\['0'\]"):
+        make(env, 1).get_term("leg")
+
+
+def test_an_unknown_entity_lists_what_there_is(env):
+    with pytest.raises(KeyError, match="robot"):
+        ActionManager({"a": KeepCfg(entity_name="dog", size=1)}, env)
+
+
+def test_build_must_return_a_term(env):
+    cfg = KeepCfg(entity_name="robot", size=1, term=lambda cfg, env: object())
+    with pytest.raises(TypeError, match="'a'.*ActionTerm.*object"):
+        ActionManager({"a": cfg}, env)
+
+
+def test_the_config_is_kept_and_none_is_skipped(env):
+    cfg = {"off": None, "a": KeepCfg(entity_name="robot", size=1)}
+    manager = ActionManager(cfg, env)
+    assert manager.active_terms == ["a"]
+    assert manager.get_term("a").cfg is cfg["a"]
+    assert manager.get_term("a")._entity is env.scene["robot"]
