@@ -1,0 +1,77 @@
+"""Saving and restoring the run-time state of a whole environment."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from mjlab.utils.state import capture_state, restore_state
+
+if TYPE_CHECKING:
+    from mjlab.envs.manager_based_rl_env import ManagerBasedRlEnv
+
+_COUNTERS = ("common_step_counter", "_sim_step_counter")
+_BUFFERS = ("episode_length_buf", "_pending_reset", "_nan_resets")
+_MANAGERS = (
+    "event_manager",
+    "command_manager",
+    "action_manager",
+    "observation_manager",
+    "termination_manager",
+    "reward_manager",
+    "curriculum_manager",
+    "metrics_manager",
+)
+
+
+def state_dict(env: ManagerBasedRlEnv) -> dict[str, Any]:
+    """Return counters, buffers, physics, scene and managers of `env`."""
+    return {
+        "num_envs": env.num_envs,
+        "counters": {name: getattr(env, name) for name in _COUNTERS},
+        "buffers": {name: getattr(env, name).clone() for name in _BUFFERS},
+        "observations": _cloned(env.obs_buf),
+        "sim": env.sim.state_dict(),
+        "scene": capture_state(env.scene),
+        "managers": {name: capture_state(getattr(env, name)) for name in _managers(env)},
+        # What curricula changed in term configs: weights, parameters, command ranges.
+        "config_edits": {name: getattr(env, name).config_edits() for name in _managers(env)},
+    }
+
+
+def load_state_dict(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
+    """Write `state` back into `env`, which was built from the same config.
+
+    Raises:
+        ValueError: the state is of another number of environments.
+    """
+    if state["num_envs"] != env.num_envs:
+        raise ValueError(
+            f"The saved environment state is of {state['num_envs']} environments; this run has "
+            f"{env.num_envs}. Resume with --num-envs {state['num_envs']} to continue exactly."
+        )
+    for name, value in state["counters"].items():
+        setattr(env, name, value)
+    for name, value in state["buffers"].items():
+        getattr(env, name).copy_(value)
+    for name, value in state["managers"].items():
+        restore_state(getattr(env, name), value)
+    for name, value in state["config_edits"].items():
+        getattr(env, name).apply_config_edits(value)
+    restore_state(env.scene, state["scene"])
+    # Physics comes last, so that entity buffers which view simulation fields end up as saved.
+    env.sim.load_state_dict(state["sim"])
+    env.obs_buf = _cloned(state["observations"])
+
+
+def _managers(env: ManagerBasedRlEnv) -> list[str]:
+    # Null managers have no state and are not marked stateful.
+    return [name for name in _MANAGERS if not type(getattr(env, name)).__name__.startswith("Null")]
+
+
+def _cloned(observations: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: value.clone() if isinstance(value, torch.Tensor) else _cloned(value)
+        for name, value in observations.items()
+    }

@@ -1,0 +1,445 @@
+"""The environment: one decision process over N parallel simulations, built from managers."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from mjlab.envs import env_state
+from mjlab.envs.env_cfg import ManagerBasedRlEnvCfg as ManagerBasedRlEnvCfg
+from mjlab.envs.env_checks import check_env_cfg
+from mjlab.managers import (
+    ActionManager,
+    CommandManager,
+    CurriculumManager,
+    EventManager,
+    MetricsManager,
+    NullCommandManager,
+    NullCurriculumManager,
+    NullMetricsManager,
+    NullRecorderManager,
+    ObservationManager,
+    RecorderManager,
+    RewardManager,
+    TerminationManager,
+)
+from mjlab.scene import Scene
+from mjlab.sim.simulation import Simulation
+from mjlab.utils import spaces
+from mjlab.utils.random import seed_rng
+
+if TYPE_CHECKING:
+    from mjlab.viewer.debug_visualizer import DebugVisualizer
+    from mjlab.viewer.offscreen_renderer import OffscreenRenderer
+
+logger = logging.getLogger(__name__)
+
+Observations = dict[str, torch.Tensor | dict[str, torch.Tensor]]
+
+
+class ManagerBasedRlEnv:
+    """N environments stepped together. All tensors have a leading dimension N.
+
+    Call `reset` before the first `step`: the constructor leaves the model's initial state.
+    """
+
+    is_vector_env = True
+
+    def __init__(
+        self,
+        cfg: ManagerBasedRlEnvCfg,
+        device: str,
+        render_mode: str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        """Build scene, simulation and managers of `cfg` on `device` (`cpu`, `cuda:0`, ...).
+
+        `render_mode` is None or `rgb_array`. Further keyword arguments are ignored.
+
+        Raises:
+            ValueError: whatever is wrong with the config, by name, before any stepping.
+        """
+        check_env_cfg(cfg)
+        self.cfg = cfg
+        cfg.seed = self.seed(-1 if cfg.seed is None else cfg.seed)
+        self.render_mode = render_mode
+        self.metadata: dict[str, Any] = {"render_modes": [None, "rgb_array"]}
+        self.extras: dict[str, Any] = {}
+        self.obs_buf: Observations = {}
+        self._device = device
+        self.scene = Scene(cfg.scene, device=device)
+        self.sim = self._create_simulation()
+        self.scene.initialize(self.sim.mj_model, self.sim.model, self.sim.data)
+        self.sim.add_forward_callback(self.scene.invalidate_sensor_caches)
+        if getattr(self.scene, "sensor_context", None) is not None:
+            self.sim.set_sensor_context(self.scene.sensor_context)
+
+        self.common_step_counter = 0
+        self._sim_step_counter = 0
+        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=device)
+        self._pending_reset = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
+        self._nan_resets = torch.zeros(self.num_envs, dtype=torch.long, device=device)
+        self._renderer: OffscreenRenderer | None = None
+        if render_mode == "rgb_array":
+            self._renderer = self._create_renderer()
+        self.metadata["render_fps"] = 1.0 / self.step_dt
+        self.load_managers()
+        self.setup_manager_visualizers()
+
+    # What there is.
+
+    @property
+    def num_envs(self) -> int:
+        """Number of environments N."""
+        return self.scene.num_envs
+
+    @property
+    def device(self) -> str:
+        """Torch device of all tensors."""
+        return self._device
+
+    @property
+    def physics_dt(self) -> float:
+        """Physics time step, in seconds."""
+        return float(self.sim.mj_model.opt.timestep)
+
+    @property
+    def step_dt(self) -> float:
+        """Environment step, in seconds: the physics time step times the decimation."""
+        return self.physics_dt * self.cfg.decimation
+
+    @property
+    def max_episode_length_s(self) -> float:
+        """Length of an episode, in seconds."""
+        return self.cfg.episode_length_s
+
+    @property
+    def max_episode_length(self) -> int:
+        """Length of an episode, in environment steps."""
+        # The small number keeps 0.14 s / 0.02 s, which is 7.0000000000000001, at 7 steps.
+        return math.ceil(self.max_episode_length_s / self.step_dt - 1e-6)
+
+    @property
+    def unwrapped(self) -> ManagerBasedRlEnv:
+        """This environment, below any wrapper."""
+        return self
+
+    # Construction.
+
+    def _create_simulation(self) -> Simulation:
+        # The XML of an entity may ask for options that nobody contradicts.
+        mujoco_cfg = self.scene.resolve_mujoco_cfg(self.cfg.sim.mujoco)
+        return Simulation(
+            self.num_envs,
+            dataclasses.replace(self.cfg.sim, mujoco=mujoco_cfg),
+            device=self._device,
+            spec=self.scene.spec,
+            variant_info=self.scene.collect_variant_info(),
+        )
+
+    def _create_renderer(self) -> OffscreenRenderer:
+        from mjlab.viewer.offscreen_renderer import OffscreenRenderer
+
+        renderer = OffscreenRenderer(
+            model=self.sim.mj_model,
+            cfg=self.cfg.viewer,
+            scene=self.scene,
+            sim_model=self.sim.model,
+            expanded_fields=self.sim.expanded_fields,
+        )
+        renderer.initialize()
+        return renderer
+
+    def load_managers(self) -> None:
+        """Build all managers, in the order in which they depend on each other."""
+        cfg = self.cfg
+        # Events come first: the model fields that they randomize have to be expanded before
+        # anything keeps a reference to them.
+        self.event_manager = EventManager(cfg.events, self)
+        self.sim.expand_model_fields(self.event_manager.domain_randomization_fields)
+        self.command_manager = (
+            CommandManager(cfg.commands, self) if cfg.commands else NullCommandManager()
+        )
+        self.action_manager = ActionManager(cfg.actions, self)
+        self.observation_manager = ObservationManager(cfg.observations, self)
+        self.termination_manager = TerminationManager(cfg.terminations, self)
+        self.reward_manager = RewardManager(
+            cfg.rewards, self, scale_by_dt=cfg.scale_rewards_by_dt
+        )
+        self.curriculum_manager = (
+            CurriculumManager(cfg.curriculum, self) if cfg.curriculum else NullCurriculumManager()
+        )
+        self.metrics_manager = (
+            MetricsManager(cfg.metrics, self) if cfg.metrics else NullMetricsManager()
+        )
+        self.recorder_manager = (
+            RecorderManager(cfg.recorders, self) if cfg.recorders else NullRecorderManager()
+        )
+        self._configure_spaces()
+        # Without anything that acts between substeps, the engine runs all of them in one go.
+        self._steps_as_one = not (
+            self.action_manager.needs_substep
+            or self.scene.needs_substep
+            or self.metrics_manager.needs_substep
+        )
+        if "startup" in self.event_manager.available_modes:
+            self.event_manager.apply(mode="startup")
+
+    def setup_manager_visualizers(self) -> None:
+        """Collect the managers that can draw into a viewer."""
+        self.manager_visualizers: dict[str, Any] = {}
+        if self.command_manager.active_terms:
+            self.manager_visualizers["command_manager"] = self.command_manager
+        self.manager_visualizers["event_manager"] = self.event_manager
+        self.manager_visualizers["reward_manager"] = self.reward_manager
+
+    def _configure_spaces(self) -> None:
+        groups: dict[str, spaces.Space] = {}
+        for name, term_names in self.observation_manager.active_terms.items():
+            dims = self.observation_manager.group_obs_dim[name]
+            if self.observation_manager.group_obs_concatenate[name]:
+                groups[name] = spaces.Box(shape=tuple(dims))
+            else:
+                terms = {
+                    term: spaces.Box(shape=tuple(dim))
+                    for term, dim in zip(term_names, dims, strict=True)
+                }
+                groups[name] = spaces.Dict(spaces=terms)
+        self.single_observation_space = spaces.Dict(spaces=groups)
+        self.single_action_space = spaces.Box(shape=(self.action_manager.total_action_dim,))
+        self.observation_space = spaces.batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = spaces.batch_space(self.single_action_space, self.num_envs)
+
+    # The loop.
+
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        env_ids: torch.Tensor | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Start new episodes in `env_ids` (None: all); return observations and extras.
+
+        A `seed` reseeds every random number generator. Observations are those of all
+        environments; only those of `env_ids` advance their delay and history buffers.
+        """
+        if seed is not None:
+            self.seed(seed)
+        if env_ids is None:
+            env_ids = torch.arange(self.num_envs, dtype=torch.long, device=self.device)
+        else:
+            env_ids = torch.as_tensor(env_ids, device=self.device).flatten()
+            env_ids = env_ids.nonzero().flatten() if env_ids.dtype == torch.bool else env_ids.long()
+        self.extras["log"] = {}
+        stepped = env_ids[self.episode_length_buf[env_ids] > 0]
+        if len(stepped) > 0:
+            self.recorder_manager.record_pre_reset(stepped)
+        self._reset_idx(env_ids)
+        self.scene.write_data_to_sim(env_ids)
+        self.sim.forward()
+        self.command_manager.compute(dt=0.0, env_ids=env_ids)
+        self.sim.sense()
+        self.obs_buf = self.observation_manager.compute(update_history=True, env_ids=env_ids)
+        self.recorder_manager.record_post_reset(env_ids)
+        return self.obs_buf, self.extras
+
+    def step(
+        self, action: torch.Tensor
+    ) -> tuple[Observations, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Advance all environments by one environment step.
+
+        The order is: process actions; `decimation` physics substeps; terminations and rewards;
+        step and interval events; resets of environments that are done; one `forward`; commands;
+        observations. Terminations and rewards therefore read derived quantities (`xpos`, `cvel`,
+        `sensordata`, contacts) one physics substep old, while `qpos` and `qvel` are current;
+        commands and observations read everything current.
+
+        Args:
+            action: (N, A) float tensor.
+
+        Returns:
+            Observations (of the new episode where an environment was reset); reward (N,);
+            terminated (N,) and truncated (N,) bool; extras, with `extras["log"]`. All but the
+            observations are overwritten by the next step.
+
+        Raises:
+            ValueError: an action of another shape, or one that is not finite.
+            RuntimeError: without `auto_reset`, an environment that is done was not reset.
+        """
+        if not self.cfg.auto_reset:
+            self._refuse_pending_resets()
+        self.extras["log"] = {}
+        self.action_manager.process_action(action.to(self.device))
+        self._run_physics()
+        self.episode_length_buf += 1
+        self.common_step_counter += 1
+
+        self.reset_buf = self.termination_manager.compute()
+        self.reset_terminated = self.termination_manager.terminated
+        self.reset_time_outs = self.termination_manager.time_outs
+        self._terminate_diverged()
+        self.reward_buf = self.reward_manager.compute(dt=self.step_dt)
+        self.metrics_manager.compute()
+        for mode in ("step", "interval"):
+            if mode in self.event_manager.available_modes:
+                self.event_manager.apply(mode=mode, dt=self.step_dt)
+
+        reset_ids = self._reset_done_envs()
+        self.sim.forward()
+        self.command_manager.compute(dt=self._command_dt(reset_ids))
+        self.sim.sense()
+        self.obs_buf = self.observation_manager.compute(update_history=True)
+        if self.cfg.auto_reset:
+            if len(reset_ids) > 0:
+                self.recorder_manager.record_post_reset(reset_ids)
+        else:
+            self._pending_reset |= self.reset_buf
+        self.recorder_manager.record_post_step()
+        return (
+            self.obs_buf,
+            self.reward_buf,
+            self.reset_terminated,
+            self.reset_time_outs,
+            self.extras,
+        )
+
+    def _run_physics(self) -> None:
+        substeps = self.cfg.decimation
+        if self._steps_as_one:
+            self._sim_step_counter += substeps
+            self.action_manager.apply_action()
+            self.scene.write_data_to_sim()
+            self.sim.step(nstep=substeps)
+            self.scene.update(dt=self.step_dt)
+            return
+        for _ in range(substeps):
+            self._sim_step_counter += 1
+            self.action_manager.apply_action()
+            self.scene.write_data_to_sim()
+            self.sim.step()
+            self.scene.update(dt=self.physics_dt)
+            self.metrics_manager.compute_substep()
+
+    def _terminate_diverged(self) -> None:
+        """End the episode of environments whose state is not finite, and count them."""
+        # A sum is finite only if every summand is.
+        checksum = self.sim.data.qpos.sum(dim=1) + self.sim.data.qvel.sum(dim=1)
+        diverged = ~torch.isfinite(checksum)
+        self.reset_terminated |= diverged
+        self.reset_buf |= diverged
+        self._nan_resets += diverged
+        self.extras["log"]["Simulation/nan_resets"] = diverged.sum()
+
+    def _reset_done_envs(self) -> torch.Tensor:
+        """Reset environments that are done, under `auto_reset`; return their ids."""
+        if not self.cfg.auto_reset:
+            return self.reset_buf.new_empty(0, dtype=torch.long)
+        reset_ids = self.reset_buf.nonzero().flatten()
+        if len(reset_ids) > 0:
+            self.recorder_manager.record_pre_reset(reset_ids)
+            self._reset_idx(reset_ids)
+            self.scene.write_data_to_sim(reset_ids)
+        return reset_ids
+
+    def _command_dt(self, reset_ids: torch.Tensor) -> float | torch.Tensor:
+        """Return the time that passed for commands: none where an episode has just begun."""
+        if len(reset_ids) == 0:
+            return self.step_dt
+        dt = torch.full((self.num_envs,), self.step_dt, device=self.device)
+        dt[reset_ids] = 0.0
+        return dt
+
+    def _refuse_pending_resets(self) -> None:
+        if self._pending_reset.any():
+            ids = self._pending_reset.nonzero().flatten().tolist()
+            raise RuntimeError(
+                f"Environments {ids[:10]}{' ...' if len(ids) > 10 else ''} are done and were not "
+                "reset. Call env.reset(env_ids=...) first, or set auto_reset=True in the config."
+            )
+
+    def _reset_idx(self, env_ids: torch.Tensor) -> None:
+        # The curriculum runs first, because it judges the state in which the episode ended.
+        self.curriculum_manager.compute(env_ids=env_ids)
+        self.sim.reset(env_ids)
+        self.scene.reset(env_ids)
+        if "reset" in self.event_manager.available_modes:
+            self.event_manager.apply(
+                mode="reset",
+                env_ids=env_ids,
+                global_env_step_count=self._sim_step_counter // self.cfg.decimation,
+            )
+        for entity in self.scene.entities.values():
+            entity.seed_position_targets(env_ids)
+        log = self.extras["log"]
+        for manager in (
+            self.observation_manager,
+            self.action_manager,
+            self.reward_manager,
+            self.metrics_manager,
+            self.curriculum_manager,
+            self.command_manager,
+            self.event_manager,
+            self.termination_manager,
+        ):
+            log.update(manager.reset(env_ids))
+        self.episode_length_buf[env_ids] = 0
+        self._pending_reset[env_ids] = False
+
+    def get_observations(self) -> Observations:
+        """Return the observations of the last step or reset."""
+        return self.observation_manager.compute()
+
+    # Seeds, rendering, saving, closing.
+
+    @staticmethod
+    def seed(seed: int = -1) -> int:
+        """Seed every random number generator; -1 draws a seed. Returns the seed used."""
+        if seed == -1:
+            seed = int(np.random.default_rng().integers(0, 10_000))
+        seed_rng(seed)
+        return seed
+
+    def render(self, camera: str | int | None = None) -> np.ndarray | None:
+        """Return an RGB image (height, width, 3) of uint8 in mode `rgb_array`, else None.
+
+        `camera` names a camera of the model; None takes the view of the config.
+        """
+        if self.render_mode in (None, "human"):
+            return None
+        if self.render_mode != "rgb_array" or self._renderer is None:
+            raise NotImplementedError(
+                f"Render mode {self.render_mode!r} is not supported; use 'rgb_array' or None."
+            )
+        self._renderer.update(
+            self.sim, debug_vis_callback=self.update_visualizers, camera=camera
+        )
+        return self._renderer.render()
+
+    def update_visualizers(self, visualizer: DebugVisualizer) -> None:
+        """Let managers and sensors draw into `visualizer`."""
+        for manager in self.manager_visualizers.values():
+            manager.debug_vis(visualizer)
+        for sensor in self.scene.sensors.values():
+            sensor.debug_vis(visualizer)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all run-time state, so that a run can resume bit for bit."""
+        return env_state.state_dict(self)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore `state_dict`; raises ValueError if it comes from another task or size."""
+        env_state.load_state_dict(self, state)
+
+    def close(self) -> None:
+        """Close the renderer, the recorders and the simulation."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+        self.recorder_manager.close()
+        self.sim.close()

@@ -1,0 +1,41 @@
+"""Action terms: how the policy's output becomes targets of an entity's actuators."""
+
+from __future__ import annotations
+
+from mjlab.envs.mdp.actions.actions import (
+    JointEffortAction,
+    JointEffortActionCfg,
+    JointPositionAction,
+    JointPositionActionCfg,
+    JointVelocityAction,
+    JointVelocityActionCfg,
+    RelativeJointPositionAction,
+    RelativeJointPositionActionCfg,
+    SiteEffortAction,
+    SiteEffortActionCfg,
+    TendonEffortAction,
+    TendonEffortActionCfg,
+    TendonLengthAction,
+    TendonLengthActionCfg,
+    TendonVelocityAction,
+    TendonVelocityActionCfg,
+)
+
+__all__ = [
+    "JointEffortAction",
+    "JointEffortActionCfg",
+    "JointPositionAction",
+    "JointPositionActionCfg",
+    "JointVelocityAction",
+    "JointVelocityActionCfg",
+    "RelativeJointPositionAction",
+    "RelativeJointPositionActionCfg",
+    "SiteEffortAction",
+    "SiteEffortActionCfg",
+    "TendonEffortAction",
+    "TendonEffortActionCfg",
+    "TendonLengthAction",
+    "TendonLengthActionCfg",
+    "TendonVelocityAction",
+    "TendonVelocityActionCfg",
+]

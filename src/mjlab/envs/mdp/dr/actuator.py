@@ -1,0 +1,268 @@
+"""Randomization of actuator gains and effort limits.
+
+Where these figures are depends on the kind of actuator: MuJoCo's own servos have them in the
+model, actuators computed outside MuJoCo in tensors of their own.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+
+from mjlab.actuator import (
+    BuiltinDcMotorActuator,
+    BuiltinPdActuator,
+    BuiltinPositionActuator,
+    DcMotorInputMode,
+    IdealPdActuator,
+    XmlActuator,
+)
+from mjlab.actuator.actuator import TransmissionType
+from mjlab.compat import older_names
+from mjlab.envs.mdp._indexing import resolve_env_ids
+from mjlab.envs.mdp.dr._actuator_selection import SelectedActuator, selected_actuators
+from mjlab.envs.mdp.dr._core import model_field
+from mjlab.envs.mdp.dr._terms import ROBOT
+from mjlab.envs.mdp.dr._types import (
+    ABS,
+    SCALE,
+    Distribution,
+    Operation,
+    read_bounds,
+    resolve_distribution,
+    resolve_operation,
+)
+from mjlab.managers.event_manager import requires_model_fields
+
+if TYPE_CHECKING:
+    from mjlab.actuator import Actuator
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.managers.scene_entity_config import SceneEntityCfg
+
+__getattr__ = older_names(__name__)
+
+
+class Place(NamedTuple):
+    """Where a figure stands in the model."""
+
+    field: str
+    axis: int
+    sign: float
+    element: int = 0
+    """Which of a target's MuJoCo actuators."""
+
+
+class Gains(NamedTuple):
+    """Places of the two gains."""
+
+    kp: tuple[Place, ...]
+    kd: tuple[Place, ...]
+
+
+_SERVO_GAINS = Gains(
+    kp=(Place("actuator_gainprm", 0, 1.0), Place("actuator_biasprm", 1, -1.0)),
+    kd=(Place("actuator_biasprm", 2, -1.0),),
+)
+_DC_MOTOR_GAINS = Gains(
+    kp=(Place("actuator_gainprm", 4, 1.0),), kd=(Place("actuator_gainprm", 6, 1.0),)
+)
+# Two MuJoCo actuators a target: the first follows the position, the second the velocity.
+_PD_GAINS = Gains(
+    kp=(Place("actuator_gainprm", 0, 1.0, 0), Place("actuator_biasprm", 1, -1.0, 0)),
+    kd=(Place("actuator_gainprm", 0, 1.0, 1), Place("actuator_biasprm", 2, -1.0, 1)),
+)
+
+
+def _range_of(field: str) -> tuple[Place, ...]:
+    return Place(field, 0, -1.0), Place(field, 1, 1.0)
+
+
+_FORCE_RANGE = _range_of("actuator_forcerange")
+
+
+@requires_model_fields("actuator_gainprm", "actuator_biasprm")
+def pd_gains(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor | None,
+    kp_range: tuple[float, float],
+    kd_range: tuple[float, float],
+    asset_cfg: SceneEntityCfg = ROBOT,
+    distribution: Distribution | str = "uniform",
+    operation: Operation | str = "scale",
+) -> None:
+    """Randomize stiffness and damping of position-controlled actuators.
+
+    Gains are drawn independently per environment and actuator: for each actuator config first all
+    stiffnesses, then all dampings.
+
+    Args:
+        env_ids: Environments to change; None means all.
+        kp_range: Stiffness (N m/rad or N/m), or its factor with "scale".
+        kd_range: Damping (N m s/rad or N s/m), or its factor with "scale".
+        asset_cfg: Entity and actuators, each selected by its own name or index.
+        distribution: "uniform", "log_uniform", or a `Distribution`.
+        operation: "scale" multiplies the configured gains, "abs" replaces them.
+
+    Raises:
+        ValueError: another operation, or a DC motor that is driven by voltage.
+        TypeError: a selected actuator has no such gains.
+    """
+    dist, op = resolve_distribution(distribution), _scale_or_abs(operation, "pd_gains")
+    bounds = read_bounds(kp_range, "kp_range"), read_bounds(kd_range, "kd_range")
+    chosen = list(selected_actuators(env, resolve_env_ids(env, env_ids), asset_cfg))
+    places = [_gain_places(selected.actuator) for selected in chosen]
+    for selected, gains in zip(chosen, places, strict=True):
+        kp, kd = (selected.draw(dist, pair, env.device) for pair in bounds)
+        if gains is None:
+            _set_ideal_gains(selected, op, kp, kd)
+            continue
+        for samples, targets in ((kp, gains.kp), (kd, gains.kd)):
+            for place in targets:
+                _write(env, selected.rows, selected.elements[place.element], place, op, samples)
+
+
+@requires_model_fields(
+    "actuator_forcerange", "actuator_ctrlrange", "jnt_actfrcrange", "tendon_actfrcrange"
+)
+def effort_limits(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor | None,
+    effort_limit_range: tuple[float, float],
+    asset_cfg: SceneEntityCfg = ROBOT,
+    distribution: Distribution | str = "uniform",
+    operation: Operation | str = "scale",
+) -> None:
+    """Randomize the largest effort of actuators, drawn per environment and actuator.
+
+    MuJoCo's own servos obey only if they were configured with an effort limit at all.
+
+    Args:
+        env_ids: Environments to change; None means all.
+        effort_limit_range: Largest effort (N m or N), or its factor with "scale".
+        asset_cfg: Entity and actuators, each selected by its own name or index.
+        distribution: "uniform", "log_uniform", or a `Distribution`.
+        operation: "scale" multiplies the configured limits, "abs" replaces them.
+
+    Raises:
+        ValueError: another operation.
+        TypeError: a selected actuator is of a kind whose limit cannot be randomized.
+    """
+    dist, op = resolve_distribution(distribution), _scale_or_abs(operation, "effort_limits")
+    bounds = read_bounds(effort_limit_range, "effort_limit_range")
+    chosen = list(selected_actuators(env, resolve_env_ids(env, env_ids), asset_cfg))
+    places = [_limit_places(selected) for selected in chosen]
+    for selected, (columns, targets) in zip(chosen, places, strict=True):
+        samples = selected.draw(dist, bounds, env.device)
+        if isinstance(selected.actuator, IdealPdActuator):
+            _set_ideal_limits(selected, op, samples)
+        for place in targets:
+            _write(env, selected.rows, columns, place, op, samples)
+
+
+def _gain_places(actuator: Actuator) -> Gains | None:
+    """Return where an actuator's gains are in the model; None if it keeps them itself."""
+    if isinstance(actuator, IdealPdActuator):
+        return None
+    if isinstance(actuator, BuiltinPdActuator):
+        return _PD_GAINS
+    if isinstance(actuator, BuiltinDcMotorActuator):
+        if actuator.cfg.mode == DcMotorInputMode.VOLTAGE:
+            raise ValueError(
+                f"pd_gains: the DC motors {list(actuator.target_names)} are driven by voltage and "
+                "have no gains. Select other actuators, or use position or velocity mode."
+            )
+        return _DC_MOTOR_GAINS
+    if _is_servo(actuator):
+        return _SERVO_GAINS
+    raise TypeError(_refusal("pd_gains", actuator))
+
+
+def _limit_places(selected: SelectedActuator) -> tuple[torch.Tensor, tuple[Place, ...]]:
+    """Return model ids and places of the effort limits of the selected targets."""
+    actuator, elements = selected.actuator, selected.elements[0]
+    if isinstance(actuator, IdealPdActuator):
+        # `set_effort_limit` carries the limit over to the ranges of the MuJoCo motor behind it.
+        return elements, ()
+    if isinstance(actuator, BuiltinPdActuator):
+        indexing, targets = selected.entity.data.indexing, actuator.target_ids[selected.targets]
+        if actuator.transmission_type == TransmissionType.JOINT:
+            return indexing.joint_ids[targets].long(), _range_of("jnt_actfrcrange")
+        return indexing.tendon_ids[targets].long(), _range_of("tendon_actfrcrange")
+    if isinstance(actuator, BuiltinDcMotorActuator) or _is_servo(actuator):
+        return elements, _FORCE_RANGE
+    raise TypeError(_refusal("effort_limits", actuator))
+
+
+def _is_servo(actuator: Actuator) -> bool:
+    if isinstance(actuator, XmlActuator):
+        return actuator.command_field == "position"
+    return isinstance(actuator, BuiltinPositionActuator)
+
+
+def _refusal(function: str, actuator: Actuator) -> str:
+    kind = type(actuator).__name__
+    if isinstance(actuator, XmlActuator):
+        kind += f" with command field {actuator.command_field!r}"
+    return (
+        f"{function}: the actuators {list(actuator.target_names)} are of kind {kind}, which it "
+        "cannot randomize. Supported: position actuators (builtin or XML), BuiltinPdActuator, "
+        "BuiltinDcMotorActuator, IdealPdActuator and its subclasses. Select others by name."
+    )
+
+
+def _scale_or_abs(operation: Operation | str, function: str) -> Operation:
+    op = resolve_operation(operation)
+    if op not in (SCALE, ABS):
+        raise ValueError(f"{function} knows the operations 'scale' and 'abs', got {op.name!r}.")
+    return op
+
+
+def _write(
+    env: ManagerBasedRlEnv,
+    rows: torch.Tensor,
+    columns: torch.Tensor,
+    place: Place,
+    op: Operation,
+    samples: torch.Tensor,
+) -> None:
+    if op is SCALE:
+        samples = env.sim.get_default_field(place.field)[columns, place.axis] * samples
+    else:
+        samples = place.sign * samples
+    model_field(env, place.field)[rows[:, None], columns[None, :], place.axis] = samples
+
+
+def _set_ideal_gains(
+    selected: SelectedActuator, op: Operation, kp: torch.Tensor, kd: torch.Tensor
+) -> None:
+    actuator = selected.actuator
+    assert isinstance(actuator, IdealPdActuator)
+    actuator.set_gains(
+        selected.rows,
+        kp=_merged(selected, actuator.stiffness, actuator.default_stiffness, op, kp),
+        kd=_merged(selected, actuator.damping, actuator.default_damping, op, kd),
+    )
+
+
+def _set_ideal_limits(selected: SelectedActuator, op: Operation, limits: torch.Tensor) -> None:
+    actuator = selected.actuator
+    assert isinstance(actuator, IdealPdActuator)
+    merged = _merged(selected, actuator.force_limit, actuator.default_force_limit, op, limits)
+    actuator.set_effort_limit(selected.rows, merged)
+
+
+def _merged(
+    selected: SelectedActuator,
+    current: torch.Tensor | None,
+    default: torch.Tensor | None,
+    op: Operation,
+    samples: torch.Tensor,
+) -> torch.Tensor:
+    """Return the rows of a parameter (R, n) with new values for the selected targets."""
+    assert current is not None
+    assert default is not None
+    merged = current[selected.rows].clone()
+    base = default[selected.rows][:, selected.targets]
+    merged[:, selected.targets] = base * samples if op is SCALE else samples
+    return merged

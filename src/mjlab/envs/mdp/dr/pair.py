@@ -1,0 +1,58 @@
+"""Randomization of explicit contact pairs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mjlab.envs.mdp.dr._core import model_field, randomize
+from mjlab.envs.mdp.dr._table import TABLE
+from mjlab.envs.mdp.dr._terms import ROBOT
+from mjlab.managers.event_manager import requires_model_fields
+
+if TYPE_CHECKING:
+    import torch
+
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.envs.mdp.dr._types import Distribution, Operation, Ranges
+    from mjlab.managers.scene_entity_config import SceneEntityCfg
+
+
+@requires_model_fields(*TABLE["pair_friction"].fields)
+def pair_friction(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor | None,
+    ranges: Ranges,
+    asset_cfg: SceneEntityCfg = ROBOT,
+    distribution: Distribution | str = "uniform",
+    operation: Operation | str = "abs",
+    axes: list[int] | None = None,
+    shared_random: bool = False,
+    isotropic: bool = False,
+) -> None:
+    """Randomize friction of contact pairs: tangent 1, tangent 2, spin, roll 1, roll 2.
+
+    Arguments are those of the other functions (see `dr.geom_friction`), with axes 0 to 4 and
+    axis 0 by default.
+
+    Args:
+        isotropic: Make friction equal in both directions: tangent 2 follows tangent 1, and
+            roll 2 follows roll 1 if a roll axis was randomized.
+    """
+    written = randomize(
+        TABLE["pair_friction"],
+        env,
+        env_ids,
+        ranges,
+        asset_cfg,
+        distribution,
+        operation,
+        axes,
+        shared_random,
+    )
+    if not isotropic:
+        return
+    field = model_field(env, "pair_friction")
+    for selection, targets in written:
+        field[(*selection.index, 1)] = field[(*selection.index, 0)]
+        if 3 in targets or 4 in targets:
+            field[(*selection.index, 4)] = field[(*selection.index, 3)]

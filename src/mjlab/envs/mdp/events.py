@@ -1,0 +1,240 @@
+"""Event terms other than domain randomization (`mjlab.envs.mdp.dr`): resets, pushes, forces.
+
+Ranges over poses and twists are dicts with the keys x, y, z, roll, pitch, yaw; missing keys are
+(0, 0). States are written to `qpos` and `qvel`: what derives from them is stale until the next
+`forward`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from mjlab.compat import older_names
+from mjlab.envs.mdp._indexing import columns, num_selected
+from mjlab.envs.mdp._indexing import resolve_env_ids as resolve_env_ids
+from mjlab.envs.mdp.body_impulse import apply_body_impulse as apply_body_impulse
+from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.utils.lab_api.math import (
+    quat_apply_inverse,
+    quat_from_euler_xyz,
+    quat_mul,
+    sample_uniform,
+)
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+    from mjlab.envs import ManagerBasedRlEnv
+
+_DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
+_SE3_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
+
+Se3Ranges = dict[str, tuple[float, float]]
+
+__getattr__ = older_names(__name__)
+
+
+def randomize_terrain(env: ManagerBasedRlEnv, env_ids: torch.Tensor | None) -> None:
+    """Move environments to a random row and column of a generated terrain; else nothing.
+
+    Place this before the terms that write root states, which read the new origins.
+    """
+    if env.scene.terrain is not None:
+        env.scene.terrain.randomize_env_origins(resolve_env_ids(env, env_ids))
+
+
+def reset_scene_to_default(env: ManagerBasedRlEnv, env_ids: torch.Tensor | None) -> None:
+    """Put every entity into its default state.
+
+    Floating bases and mocap bases go to their default pose plus the environment's origin; other
+    fixed bases stay where they are.
+    """
+    ids = resolve_env_ids(env, env_ids)
+    for entity in env.scene.entities.values():
+        is_mocap = _is_mocap(entity)
+        if is_mocap or not entity.is_fixed_base:
+            root = entity.data.default_root_state[ids]
+            root[:, :3] += env.scene.env_origins[ids]
+            if is_mocap:
+                entity.write_mocap_pose_to_sim(root[:, :7], env_ids=ids)
+            else:
+                entity.write_root_state_to_sim(root, env_ids=ids)
+        if entity.is_articulated:
+            entity.write_joint_state_to_sim(
+                entity.data.default_joint_pos[ids], entity.data.default_joint_vel[ids], env_ids=ids
+            )
+
+
+def reset_root_state_uniform(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor | None,
+    pose_range: Se3Ranges,
+    velocity_range: Se3Ranges | None = None,
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+) -> None:
+    """Put the root at its default state plus a uniform sample and the environment's origin.
+
+    The orientation is `default * Rz(yaw) Ry(pitch) Rx(roll)`, a turn about the body's axes. The
+    velocity (linear at the link's origin, angular) is in world axes. A mocap base takes the pose.
+
+    Raises:
+        ValueError: the base is fixed and no mocap body, or a range has an unknown key.
+    """
+    ids = resolve_env_ids(env, env_ids)
+    asset: Entity = env.scene[asset_cfg.name]
+    pose = _sample_se3(pose_range, len(ids), env.device)
+    position = pose[:, :3]
+    position += asset.data.default_root_state[ids, :3]
+    position += env.scene.env_origins[ids]
+    _write_root(asset, asset_cfg.name, ids, pose, velocity_range)
+
+
+def reset_root_state_from_flat_patches(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor | None,
+    patch_name: str = "spawn",
+    pose_range: Se3Ranges | None = None,
+    velocity_range: Se3Ranges | None = None,
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+) -> None:
+    """Put the root on a random flat patch of the environment's terrain cell.
+
+    Position: the patch plus a uniform sample, and in z also the default height. Orientation and
+    velocity are those of `reset_root_state_uniform`, which is used as it is where the terrain has
+    no patches of that name.
+
+    Raises:
+        ValueError: the base is fixed and no mocap body, or a range has an unknown key.
+    """
+    pose_range = pose_range or {}
+    terrain = env.scene.terrain
+    patches = None if terrain is None else terrain.flat_patches.get(patch_name)
+    levels = None if terrain is None else terrain.terrain_levels
+    types = None if terrain is None else terrain.terrain_types
+    if patches is None or levels is None or types is None:
+        reset_root_state_uniform(env, env_ids, pose_range, velocity_range, asset_cfg)
+        return
+    ids = resolve_env_ids(env, env_ids)
+    asset: Entity = env.scene[asset_cfg.name]
+    picks = torch.randint(patches.shape[2], (len(ids),), device=env.device)
+    patch = patches[levels[ids], types[ids], picks]
+    pose = _sample_se3(pose_range, len(ids), env.device)
+    pose[:, :3] += patch
+    pose[:, 2] += asset.data.default_root_state[ids, 2]
+    _write_root(asset, asset_cfg.name, ids, pose, velocity_range)
+
+
+def reset_joints_by_offset(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor | None,
+    position_range: tuple[float, float],
+    velocity_range: tuple[float, float],
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+) -> None:
+    """Put joints at their defaults plus uniform offsets; positions stay within the soft limits.
+
+    Args:
+        position_range: Bounds of the position offset (rad or m).
+        velocity_range: Bounds of the velocity offset (rad/s or m/s).
+    """
+    ids = resolve_env_ids(env, env_ids)
+    asset: Entity = env.scene[asset_cfg.name]
+    data, joints = asset.data, columns(asset_cfg.joint_ids, env.device)
+    position = data.default_joint_pos[ids][:, joints]
+    position += sample_uniform(*position_range, position.shape, env.device)
+    limits = data.soft_joint_pos_limits[ids][:, joints]
+    position.clamp_(min=limits[..., 0], max=limits[..., 1])
+    velocity = data.default_joint_vel[ids][:, joints]
+    velocity += sample_uniform(*velocity_range, velocity.shape, env.device)
+    asset.write_joint_state_to_sim(position, velocity, joint_ids=joints, env_ids=ids)
+
+
+def push_by_setting_velocity(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor | None,
+    velocity_range: Se3Ranges,
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+) -> None:
+    """Add a uniform sample to the root's velocity: linear (m/s) and angular (rad/s), world axes.
+
+    The sample is added to `qvel`, the velocity that the last substep ended with, so that a push
+    changes the velocity by the sample and by nothing else.
+
+    Raises:
+        ValueError: the base is fixed, or the range has an unknown key.
+    """
+    ids = resolve_env_ids(env, env_ids)
+    asset: Entity = env.scene[asset_cfg.name]
+    if asset.is_fixed_base:
+        raise ValueError(
+            f"push_by_setting_velocity: entity {asset_cfg.name!r} has a fixed base, which has no "
+            "velocity to change. Select an entity with a free joint."
+        )
+    change = _sample_se3(velocity_range, len(ids), env.device)
+    indexing, sim_data = asset.data.indexing, env.sim.data
+    # The angular part of a free joint's velocity is in the body's frame.
+    quat = sim_data.qpos[ids[:, None], indexing.free_joint_q_adr[3:7]]
+    change[:, 3:] = quat_apply_inverse(quat, change[:, 3:])
+    sim_data.qvel[ids[:, None], indexing.free_joint_v_adr] += change
+
+
+def apply_external_force_torque(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor | None,
+    force_range: tuple[float, float],
+    torque_range: tuple[float, float],
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+) -> None:
+    """Apply a force (N) and a torque (N m) to bodies, each component uniform, in world axes.
+
+    They act at the bodies' centres of mass until they are overwritten or the environment resets.
+    """
+    ids = resolve_env_ids(env, env_ids)
+    asset: Entity = env.scene[asset_cfg.name]
+    shape = (len(ids), num_selected(asset_cfg.body_ids, len(asset.data.indexing.body_ids)), 3)
+    forces = sample_uniform(*force_range, shape, env.device)
+    torques = sample_uniform(*torque_range, shape, env.device)
+    asset.write_external_wrench_to_sim(
+        forces, torques, env_ids=ids, body_ids=columns(asset_cfg.body_ids, env.device)
+    )
+
+
+def _is_mocap(entity: Entity) -> bool:
+    # Looked up in the indexing, because resets are frequent and walking the spec is slow.
+    return entity.data.indexing.mocap_id is not None
+
+
+def _sample_se3(ranges: Se3Ranges, count: int, device: str) -> torch.Tensor:
+    """Draw (count, 6) in the order of the keys; all six are drawn, whichever are given."""
+    unknown = [key for key in ranges if key not in _SE3_KEYS]
+    if unknown:
+        raise ValueError(f"Ranges have unknown keys {unknown}; the keys are {list(_SE3_KEYS)}.")
+    bounds = torch.tensor([ranges.get(key, (0.0, 0.0)) for key in _SE3_KEYS], device=device)
+    return sample_uniform(bounds[:, 0], bounds[:, 1], (count, 6), device)
+
+
+def _write_root(
+    asset: Entity,
+    name: str,
+    ids: torch.Tensor,
+    pose: torch.Tensor,
+    velocity_range: Se3Ranges | None,
+) -> None:
+    """Write positions and turns (K, 6) and, for a floating base, a sampled velocity."""
+    default = asset.data.default_root_state[ids]
+    turn = quat_from_euler_xyz(pose[:, 3], pose[:, 4], pose[:, 5])
+    root_pose = torch.cat((pose[:, :3], quat_mul(default[:, 3:7], turn)), dim=1)
+    if _is_mocap(asset):
+        asset.write_mocap_pose_to_sim(root_pose, env_ids=ids)
+        return
+    if asset.is_fixed_base:
+        raise ValueError(
+            f"The root of entity {name!r} is fixed and no mocap body, so its pose cannot be reset. "
+            "Select an entity with a free joint or a mocap base."
+        )
+    velocity = _sample_se3(velocity_range or {}, len(ids), str(ids.device))
+    velocity += default[:, 7:13]
+    # The pose comes first: writing the velocity rotates its angular part into the body's frame.
+    asset.write_root_link_pose_to_sim(root_pose, env_ids=ids)
+    asset.write_root_link_velocity_to_sim(velocity, env_ids=ids)

@@ -1,0 +1,17 @@
+"""Metric terms: logged, not rewarded. Each returns (N,)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
+
+    from mjlab.envs import ManagerBasedRlEnv
+
+
+def mean_action_acc(env: ManagerBasedRlEnv) -> torch.Tensor:
+    """Mean over the action's components of the absolute second difference of the raw action."""
+    actions = env.action_manager
+    second = actions.action - 2.0 * actions.prev_action + actions.prev_prev_action
+    return second.abs().mean(dim=1)

@@ -1,0 +1,144 @@
+"""Reward terms, without weight. Each returns (N,)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from mjlab.envs.mdp._indexing import columns
+from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.utils.lab_api.string import resolve_matching_names_values
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.managers.reward_manager import RewardTermCfg
+
+_DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
+
+
+def is_alive(env: ManagerBasedRlEnv) -> torch.Tensor:
+    """1 unless the episode terminated; a time-out counts as alive."""
+    return (~env.termination_manager.terminated).float()
+
+
+def is_terminated(env: ManagerBasedRlEnv) -> torch.Tensor:
+    """1 if the episode terminated; a time-out does not count."""
+    return env.termination_manager.terminated.float()
+
+
+def joint_torques_l2(
+    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
+) -> torch.Tensor:
+    """Sum of squared actuator forces, before their gear, over the selected **actuators**."""
+    asset: Entity = env.scene[asset_cfg.name]
+    forces = asset.data.actuator_force[:, columns(asset_cfg.actuator_ids, env.device)]
+    return forces.square().sum(dim=1)
+
+
+def joint_vel_l2(
+    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
+) -> torch.Tensor:
+    """Sum of squared joint velocities."""
+    asset: Entity = env.scene[asset_cfg.name]
+    velocities = asset.data.joint_vel[:, columns(asset_cfg.joint_ids, env.device)]
+    return velocities.square().sum(dim=1)
+
+
+def joint_acc_l2(
+    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
+) -> torch.Tensor:
+    """Sum of squared joint accelerations."""
+    asset: Entity = env.scene[asset_cfg.name]
+    accelerations = asset.data.joint_acc[:, columns(asset_cfg.joint_ids, env.device)]
+    return accelerations.square().sum(dim=1)
+
+
+def action_rate_l2(env: ManagerBasedRlEnv) -> torch.Tensor:
+    """Sum of squared changes of the raw action since the last step.
+
+    History is zero after a reset, so the first value of an episode is that of the action itself.
+    """
+    actions = env.action_manager
+    return (actions.action - actions.prev_action).square().sum(dim=1)
+
+
+def action_acc_l2(env: ManagerBasedRlEnv) -> torch.Tensor:
+    """Sum of squared second differences of the raw action."""
+    actions = env.action_manager
+    second = actions.action - 2.0 * actions.prev_action + actions.prev_prev_action
+    return second.square().sum(dim=1)
+
+
+def joint_pos_limits(
+    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
+) -> torch.Tensor:
+    """Sum of the distances by which joints are beyond their soft limits (rad or m)."""
+    asset: Entity = env.scene[asset_cfg.name]
+    joints = columns(asset_cfg.joint_ids, env.device)
+    position = asset.data.joint_pos[:, joints]
+    limits = asset.data.soft_joint_pos_limits[:, joints]
+    below = (limits[..., 0] - position).clamp_(min=0.0)
+    above = (position - limits[..., 1]).clamp_(min=0.0)
+    return below.add_(above).sum(dim=1)
+
+
+def flat_orientation_l2(
+    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
+) -> torch.Tensor:
+    """Squared horizontal part of the projected gravity: sin^2 of the tilt of the root."""
+    asset: Entity = env.scene[asset_cfg.name]
+    return asset.data.projected_gravity_b[:, :2].square().sum(dim=1)
+
+
+class posture:
+    """`exp(-mean_j ((q_j - q0_j) / std_j)^2)` over the selected joints, q0 the default positions.
+
+    Params:
+        std: Dict of joint name pattern to standard deviation (rad or m). Read once; each pattern
+            must match a whole name, and every selected joint must be covered.
+        asset_cfg: Entity and joints; `joint_names` must be set.
+    """
+
+    # Follows from the config, so it is no run-time state.
+    _transient = {"std"}
+
+    def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
+        asset_cfg: SceneEntityCfg = cfg.params["asset_cfg"]
+        if asset_cfg.joint_names is None:
+            raise ValueError(
+                "posture: asset_cfg.joint_names must be set, since std is given by joint name. "
+                "Use ('.*',) for all joints."
+            )
+        # The names are in the order of the joint ids, whichever order the config asks for.
+        names = list(asset_cfg.joint_names)
+        _, covered, values = resolve_matching_names_values(cfg.params["std"], names)
+        missing = [name for name in names if name not in covered]
+        if missing:
+            raise ValueError(
+                f"posture: std has no entry for the joints {missing}. Its patterns "
+                f"{list(cfg.params['std'])} must cover every selected joint."
+            )
+        self.std = torch.tensor(values, dtype=torch.float, device=env.device)
+
+    def __call__(
+        self, env: ManagerBasedRlEnv, std: object, asset_cfg: SceneEntityCfg
+    ) -> torch.Tensor:
+        asset: Entity = env.scene[asset_cfg.name]
+        joints = columns(asset_cfg.joint_ids, env.device)
+        error = asset.data.joint_pos[:, joints] - asset.data.default_joint_pos[:, joints]
+        return torch.exp(-(error / self.std).square().mean(dim=1))
+
+
+class electrical_power_cost:
+    """Power that the actuators put into the selected joints (W), braking counted as zero."""
+
+    def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
+        pass
+
+    def __call__(self, env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
+        asset: Entity = env.scene[asset_cfg.name]
+        joints = columns(asset_cfg.joint_ids, env.device)
+        power = asset.data.qfrc_actuator[:, joints] * asset.data.joint_vel[:, joints]
+        return power.clamp_(min=0.0).sum(dim=1)

@@ -1,0 +1,47 @@
+"""Termination terms. Each returns bool (N,)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.utils.nan_guard import NanGuard
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+    from mjlab.envs import ManagerBasedRlEnv
+
+_DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
+
+
+def time_out(env: ManagerBasedRlEnv) -> torch.Tensor:
+    """The episode has reached its maximum length."""
+    return env.episode_length_buf >= env.max_episode_length
+
+
+def bad_orientation(
+    env: ManagerBasedRlEnv,
+    limit_angle: float,
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+) -> torch.Tensor:
+    """The root is tilted from upright by more than `limit_angle` (rad)."""
+    asset: Entity = env.scene[asset_cfg.name]
+    up = (-asset.data.projected_gravity_b[:, 2]).clamp_(-1.0, 1.0)
+    return torch.acos(up) > limit_angle
+
+
+def root_height_below_minimum(
+    env: ManagerBasedRlEnv,
+    minimum_height: float,
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+) -> torch.Tensor:
+    """The root is lower than `minimum_height` (m), in world coordinates."""
+    asset: Entity = env.scene[asset_cfg.name]
+    return asset.data.root_link_pos_w[:, 2] < minimum_height
+
+
+def nan_detection(env: ManagerBasedRlEnv) -> torch.Tensor:
+    """Positions, velocities, accelerations or sensor data are NaN or infinite."""
+    return NanGuard.detect_nans(env.sim.data)

@@ -1,0 +1,183 @@
+"""A batched signal seen a random number of steps late."""
+
+from __future__ import annotations
+
+import torch
+
+from mjlab.utils.buffers.circular_buffer import BatchIds, CircularBuffer
+from mjlab.utils.state import stateful
+
+
+@stateful
+class DelayBuffer:
+    """Delays a signal of shape (batch_size, ...) by a random whole number of steps.
+
+    Each step: `append` a frame, then `compute` the delayed one. Lags are uniform integers in
+    [min_lag, max_lag], drawn at construction, at reset, and whenever a row is due: at every
+    `compute`, or every `update_period` of them. A row that is due keeps its lag with probability
+    `hold_prob`. A lag that goes back before the first frame gives the first frame.
+    """
+
+    def __init__(
+        self,
+        min_lag: int = 0,
+        max_lag: int = 3,
+        batch_size: int = 1,
+        device: str = "cpu",
+        per_env: bool = True,
+        hold_prob: float = 0.0,
+        update_period: int = 0,
+        per_env_phase: bool = True,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """Make an empty buffer.
+
+        Args:
+            min_lag: Smallest lag, in steps.
+            max_lag: Largest lag, in steps.
+            batch_size: Number of rows.
+            device: Device of the frames.
+            per_env: Each row has a lag of its own; False: one lag, drawn once for all rows.
+            hold_prob: Probability of keeping the lag when due.
+            update_period: Steps between draws; 0 draws at every step.
+            per_env_phase: Rows are due at different steps. Without `per_env` there is one phase,
+                random all the same.
+            generator: Source of random numbers; None takes torch's own.
+
+        Raises `ValueError` for lags, a probability or a period out of range.
+        """
+        _validate(min_lag, max_lag, hold_prob, update_period)
+        self._min_lag = min_lag
+        self._max_lag = max_lag
+        self._batch_size = batch_size
+        self._device = device
+        self._per_env = per_env
+        self._hold_prob = hold_prob
+        self._update_period = update_period
+        self._random_phase = per_env_phase and update_period > 0
+        self._generator = generator
+        self._buffer = CircularBuffer(max_lag + 1, batch_size, device)
+        # What is drawn: one entry a row, or a single one for all of them.
+        self._num_draws = batch_size if per_env else 1
+        self._drawn_lags = self._draw_lags()
+        self._phase = self._draw_phases()
+        self._step_count = torch.zeros_like(self._drawn_lags)
+        # What is in use differs from what was drawn only where `set_lags` was called.
+        self._current_lags = self._drawn_lags.expand(batch_size).clone()
+
+    @property
+    def is_initialized(self) -> bool:
+        """Whether a frame has been appended."""
+        return self._buffer.is_initialized
+
+    @property
+    def current_lags(self) -> torch.Tensor:
+        """The lags in use; (batch_size,) int64."""
+        return self._current_lags
+
+    def append(self, data: torch.Tensor) -> None:
+        """Push a frame of shape (batch_size, ...). Raises `ValueError` for another shape."""
+        self._buffer.append(data)
+
+    def backfill(self, data: torch.Tensor, batch_ids: BatchIds) -> None:
+        """Start the rows `batch_ids` anew with their rows of `data`, (batch_size, ...).
+
+        This is their first step, as `append` and `compute` are on the other path, so that reading
+        with `peek` afterwards leaves them where that path would. Other rows do not change. Raises
+        `RuntimeError` before the first `append`.
+        """
+        self._buffer.backfill(data, batch_ids)
+        if self._per_env:
+            self._step_count[batch_ids] = 1
+
+    def compute(self) -> torch.Tensor:
+        """Draw lags where due, and return the delayed frame, (batch_size, ...)."""
+        if self._min_lag < self._max_lag:
+            self._update_lags()
+        return self.peek()
+
+    def peek(self) -> torch.Tensor:
+        """Return the delayed frame, (batch_size, ...), without drawing lags.
+
+        Raises `RuntimeError` before the first `append`.
+        """
+        return self._buffer[self._current_lags]
+
+    def reset(self, batch_ids: BatchIds | None = None) -> None:
+        """Forget the frames of the given rows (None: all) and draw new lags for them.
+
+        Without `per_env` the lag belongs to all rows: only a reset of all of them draws it anew.
+        """
+        rows = slice(None) if batch_ids is None else batch_ids
+        self._buffer.reset(rows)
+        if self._per_env:
+            self._drawn_lags[rows] = self._draw_lags()[rows]
+            self._phase[rows] = self._draw_phases()[rows]
+            self._step_count[rows] = 0
+        elif isinstance(rows, slice) and rows == slice(None):
+            self._drawn_lags.copy_(self._draw_lags())
+            self._phase.copy_(self._draw_phases())
+            self._step_count.zero_()
+        self._current_lags[rows] = self._drawn_lags.expand(self._batch_size)[rows]
+
+    def set_lags(self, lags: torch.Tensor, batch_ids: BatchIds | None = None) -> None:
+        """Use the given lags, brought into [min_lag, max_lag], until the next draw.
+
+        Args:
+            lags: One lag, or one for each of the given rows.
+            batch_ids: The rows; None for all.
+        """
+        rows = slice(None) if batch_ids is None else batch_ids
+        lags = torch.as_tensor(lags, device=self._device)
+        self._current_lags[rows] = lags.to(torch.int64).clamp(self._min_lag, self._max_lag)
+
+    def _update_lags(self) -> None:
+        lags = self._draw_lags()
+        change: torch.Tensor | None = None
+        if self._update_period > 0:
+            change = (self._step_count + self._phase) % self._update_period == 0
+        if self._hold_prob > 0:
+            moved = self._draw_uniform() >= self._hold_prob
+            change = moved if change is None else change & moved
+        self._step_count += 1
+        if change is None:
+            self._drawn_lags.copy_(lags)
+            self._current_lags.copy_(lags.expand(self._batch_size))
+            return
+        torch.where(change, lags, self._drawn_lags, out=self._drawn_lags)
+        torch.where(change, lags, self._current_lags, out=self._current_lags)
+
+    def _draw_lags(self) -> torch.Tensor:
+        return self._draw_integers(self._min_lag, self._max_lag + 1)
+
+    def _draw_phases(self) -> torch.Tensor:
+        if self._random_phase:
+            return self._draw_integers(0, self._update_period)
+        return torch.zeros(self._num_draws, dtype=torch.int64, device=self._device)
+
+    def _draw_integers(self, low: int, high: int) -> torch.Tensor:
+        if high - low == 1:
+            return torch.full((self._num_draws,), low, dtype=torch.int64, device=self._device)
+        return torch.randint(
+            low, high, (self._num_draws,), generator=self._generator, device=self._source_device()
+        ).to(self._device)
+
+    def _draw_uniform(self) -> torch.Tensor:
+        return torch.rand(
+            self._num_draws, generator=self._generator, device=self._source_device()
+        ).to(self._device)
+
+    def _source_device(self) -> torch.device | str:
+        # A generator only makes numbers on its own device.
+        return self._device if self._generator is None else self._generator.device
+
+
+def _validate(min_lag: int, max_lag: int, hold_prob: float, update_period: int) -> None:
+    if min_lag < 0:
+        raise ValueError(f"min_lag is {min_lag}; it must be at least 0.")
+    if max_lag < min_lag:
+        raise ValueError(f"max_lag is {max_lag}; it must be at least min_lag, {min_lag}.")
+    if not 0.0 <= hold_prob <= 1.0:
+        raise ValueError(f"hold_prob is {hold_prob}; it must be from 0 to 1.")
+    if update_period < 0:
+        raise ValueError(f"update_period is {update_period}; it must be at least 0.")

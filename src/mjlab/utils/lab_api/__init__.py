@@ -1,0 +1,1 @@
+"""Helpers that keep the names and conventions of the Isaac Lab utilities."""

@@ -1,0 +1,178 @@
+"""Strict matching of names by regular expression, and conversions to and from strings.
+
+Every pattern must match a whole name (`re.fullmatch`), and mistakes are errors. The lenient kind
+is in `mjlab.utils.string`.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from mjlab.utils.string import compile_pattern, qualified_name
+
+
+def resolve_matching_names(
+    keys: str | Sequence[str],
+    list_of_strings: Sequence[str],
+    preserve_order: bool = False,
+) -> tuple[list[int], list[str]]:
+    """Return the indices and the names that the patterns match.
+
+    Args:
+        keys: One regular expression or several. No expressions select nothing.
+        list_of_strings: The names to choose from.
+        preserve_order: False keeps the order of the names. True groups them by pattern, in the
+            order of `keys`, with the order of the names inside a group.
+
+    Raises `ValueError` if a pattern matches no name, or two patterns match one name.
+    """
+    keys = [keys] if isinstance(keys, str) else list(keys)
+    owners = _match_names(keys, list_of_strings)
+    indices = [index for index, owner in enumerate(owners) if owner is not None]
+    if preserve_order:
+        # `sorted` is stable, so the order of the names remains inside a group.
+        indices = sorted(indices, key=lambda index: owners[index] or 0)
+    return indices, [list_of_strings[index] for index in indices]
+
+
+def resolve_matching_names_values(
+    data: dict[str, Any], list_of_strings: Sequence[str], preserve_order: bool = False
+) -> tuple[list[int], list[str], list[Any]]:
+    """Return the indices, the names and the values of the names that the keys of `data` match.
+
+    The keys are regular expressions under the rules of `resolve_matching_names`. Raises
+    `TypeError` if `data` is not a dict, and `ValueError` as there.
+    """
+    if not isinstance(data, dict):
+        raise TypeError(
+            f"Expected a dict of regular expression to value, got {type(data).__name__}: {data!r}."
+        )
+    indices, names = resolve_matching_names(list(data), list_of_strings, preserve_order)
+    owners = _match_names(list(data), list_of_strings)
+    values = list(data.values())
+    return indices, names, [values[owners[index] or 0] for index in indices]
+
+
+def _match_names(keys: Sequence[str], names: Sequence[str]) -> list[int | None]:
+    """Return, for each name, the position of the key that matches it, or None."""
+    patterns = [compile_pattern(key) for key in keys]
+    owners: list[int | None] = []
+    for name in names:
+        matching = [i for i, pattern in enumerate(patterns) if pattern.fullmatch(name)]
+        if len(matching) > 1:
+            raise ValueError(
+                f"The name {name!r} is matched by several patterns: "
+                f"{[keys[i] for i in matching]}. Each name may be matched by one pattern only."
+                + _matches_report(keys, names)
+            )
+        owners.append(matching[0] if matching else None)
+    unmatched = [key for i, key in enumerate(keys) if i not in owners]
+    if unmatched:
+        raise ValueError(
+            f"These patterns match no name: {unmatched}. A pattern must match a whole name."
+            + _matches_report(keys, names)
+        )
+    return owners
+
+
+def _matches_report(keys: Sequence[str], names: Sequence[str]) -> str:
+    lines = [f"\n  {key!r}: {[n for n in names if re.fullmatch(key, n)]}" for key in keys]
+    return f"\nMatches:{''.join(lines)}\nAvailable names: {list(names)}"
+
+
+def to_camel_case(snake_str: str, to: str = "cC") -> str:
+    """Convert `snake_case` to `camelCase` ("cC") or `CamelCase` ("CC").
+
+    Raises `ValueError` for another `to`.
+    """
+    if to not in ("cC", "CC"):
+        raise ValueError(f"to={to!r}; it must be 'cC' (camelCase) or 'CC' (CamelCase).")
+    first, *rest = snake_str.split("_")
+    head = first if to == "cC" else first[:1].upper() + first[1:]
+    return head + "".join(word[:1].upper() + word[1:] for word in rest)
+
+
+def to_snake_case(camel_str: str) -> str:
+    """Convert `CamelCase` to `snake_case`; runs of capitals are one word."""
+    words = re.sub(r"([A-Z]+)([A-Z][a-z])", r"\1_\2", camel_str)
+    return re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", words).lower()
+
+
+def string_to_slice(s: str) -> slice:
+    """Convert "slice(0, 3, None)", as `str` of a slice writes it, back to the slice.
+
+    Raises `ValueError` for anything else.
+    """
+    match = re.fullmatch(r"slice\((.*)\)", s.strip())
+    parts = [part.strip() for part in match.group(1).split(",")] if match else []
+    if not 1 <= len(parts) <= 3 or any(not re.fullmatch(r"None|-?\d+", part) for part in parts):
+        raise ValueError(f"{s!r} is no slice; expected a form like 'slice(0, 3, None)'.")
+    return slice(*(None if part == "None" else int(part) for part in parts))
+
+
+def is_lambda_expression(name: str) -> bool:
+    """Return whether the string is the source of a lambda expression."""
+    try:
+        parsed = ast.parse(name.strip(), mode="eval")
+    except (SyntaxError, ValueError):
+        return False
+    return isinstance(parsed.body, ast.Lambda)
+
+
+def callable_to_string(value: Callable) -> str:
+    """Return "module:qualified.name" of a callable, or the source of a lambda.
+
+    Raises `ValueError` if the value is not callable, or is a lambda whose source is not found.
+    """
+    if not callable(value):
+        found = f"{type(value).__name__}: {value!r}"
+        raise ValueError(f"Expected something callable, got {found}.")
+    if getattr(value, "__name__", "") == "<lambda>":
+        return _lambda_source(value)
+    return qualified_name(value)
+
+
+def _lambda_source(function: Callable) -> str:
+    try:
+        # A lambda inside a call or a dict is no complete statement: take the text from "lambda"
+        # on and drop characters at the end until what is left is one expression.
+        text = inspect.getsource(function).strip()
+    except (OSError, TypeError) as error:
+        raise ValueError(f"The source of the lambda {function!r} is not available.") from error
+    if text.count("lambda") == 1:
+        text = text[text.index("lambda") :]
+        for end in range(len(text), 0, -1):
+            if is_lambda_expression(text[:end]):
+                return text[:end].strip()
+    raise ValueError(
+        f"The source of {function!r} cannot be told apart from its surroundings; "
+        "use a named function, or a lambda that is alone on its line."
+    )
+
+
+def string_to_callable(name: str) -> Callable:
+    """Return the callable that "module:qualified.name" or the source of a lambda stands for.
+
+    A lambda is evaluated: pass only strings you trust. Raises `ValueError` if the string has
+    neither form, or if what it names does not exist or is not callable.
+    """
+    if is_lambda_expression(name):
+        return eval(name.strip())
+    module_name, separator, attribute = name.partition(":")
+    if not separator or not module_name or not attribute:
+        raise ValueError(f"{name!r} names no callable; expected 'module:name' or a lambda.")
+    try:
+        found: Any = importlib.import_module(module_name)
+        for part in attribute.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"{name!r} cannot be found: {error}.") from error
+    if not callable(found):
+        kind = type(found).__name__
+        raise ValueError(f"{name!r} is a {kind}, which is not callable.")
+    return found

@@ -1,0 +1,27 @@
+"""Messages to the person at the terminal."""
+
+from __future__ import annotations
+
+import sys
+
+_CODES = {
+    "red": 31,
+    "green": 32,
+    "yellow": 33,
+    "blue": 34,
+    "magenta": 35,
+    "cyan": 36,
+    "white": 37,
+}
+
+
+def print_info(message: str, color: str = "green") -> None:
+    """Print a message, coloured where the output is a terminal. For command lines, not libraries.
+
+    Raises `ValueError` for an unknown colour.
+    """
+    if color not in _CODES:
+        raise ValueError(f"Unknown colour {color!r}; use one of {list(_CODES)}.")
+    if sys.stdout.isatty():
+        message = f"\033[{_CODES[color]}m{message}\033[0m"
+    print(message)

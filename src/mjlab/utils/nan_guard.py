@@ -1,0 +1,316 @@
+"""Find states that turned NaN or infinite, and keep what led to them for replay."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+import tempfile
+from collections import deque
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import mujoco
+    import numpy as np
+    import torch
+
+logger = logging.getLogger(__name__)
+
+CHECKED_FIELDS = ("qpos", "qvel", "qacc", "qacc_warmstart", "sensordata")
+"""Fields of which one NaN or infinite value makes an environment invalid."""
+
+_PHYSICS_STATE = ("qpos", "qvel", "act", "history")
+_MOCAP_STATE = ("mocap_pos", "mocap_quat")
+_INPUTS = ("ctrl", "xfrc_applied")
+_FORMAT = 2
+
+
+@dataclass
+class NanGuardCfg:
+    """Recording of the physics states that lead to NaN."""
+
+    enabled: bool = False
+    """Whether to record. Recording copies the state before every substep and waits for the GPU
+    after it, so leave it off unless you are hunting a NaN."""
+    buffer_size: int = 100
+    """Number of substeps kept."""
+    output_dir: str = field(
+        default_factory=lambda: str(Path(tempfile.gettempdir()) / "mjlab" / "nan_dumps")
+    )
+    """Folder into which the dump is written."""
+    max_envs_to_dump: int = 5
+    """Number of environments in a dump; the first that went NaN are taken."""
+
+
+class NanGuard:
+    """Keeps the last states of all environments and writes them out when one turns NaN.
+
+    Only the first detection is written. The guard neither stops the simulation nor repairs
+    anything; resetting environments that went NaN is the environment's task, see `detect_nans`.
+    """
+
+    def __init__(
+        self,
+        cfg: NanGuardCfg,
+        num_envs: int,
+        mj_model: mujoco.MjModel,
+        *,
+        model_fields: Callable[[], Mapping[str, torch.Tensor]] | None = None,
+    ) -> None:
+        """Prepare to record `num_envs` environments of `mj_model`.
+
+        `model_fields` returns the model fields that differ between environments, each (N, ...), at
+        the time of a dump; without them a dump holds the model as it was compiled.
+
+        Raises:
+            ValueError: a buffer size or a number of environments to dump below 1.
+        """
+        for name in ("buffer_size", "max_envs_to_dump"):
+            if getattr(cfg, name) < 1:
+                raise ValueError(
+                    f"NanGuardCfg.{name} is {getattr(cfg, name)}; it has to be at least 1."
+                )
+        self.cfg = cfg
+        self.enabled = cfg.enabled
+        self.num_envs = num_envs
+        self.mj_model = mj_model
+        self.model_fields = model_fields
+        self.buffer: deque[dict[str, torch.Tensor]] = deque(maxlen=cfg.buffer_size)
+        self.dump_path: Path | None = None
+        self._steps = 0
+        self._dumped = False
+
+    def capture(self, wp_data: Any) -> None:
+        """Remember the present state of all environments; call before a substep."""
+        if self.enabled and not self._dumped:
+            names = (*self._state_fields(), *self._input_fields())
+            self.buffer.append({name: getattr(wp_data, name).clone() for name in names})
+            self._steps += 1
+
+    def check_and_dump(self, data: Any) -> bool:
+        """Return whether any environment is invalid; write the dump on the first detection."""
+        if not self.enabled or self._dumped:
+            return False
+        invalid = self.detect_nans(data)
+        if not bool(invalid.any()):
+            return False
+        self._dumped = True
+        ids = invalid.nonzero().flatten().tolist()
+        try:
+            self.dump_path = self._dump(ids)
+        except OSError as error:
+            # A full disk must not end the run that is being watched.
+            logger.error(
+                "Environments %s turned NaN, but the dump could not be written to %s: %s.",
+                ids[:10],
+                self.cfg.output_dir,
+                error,
+            )
+        else:
+            logger.warning(
+                "Environments %s turned NaN at substep %d; the states before are in %s (viz-nan "
+                "shows them).",
+                ids[:10],
+                self._steps,
+                self.dump_path,
+            )
+        self.buffer.clear()
+        return True
+
+    @contextmanager
+    def watch(self, wp_data: Any) -> Generator[None]:
+        """Capture before the enclosed substep and check after it."""
+        self.capture(wp_data)
+        yield
+        self.check_and_dump(wp_data)
+
+    @staticmethod
+    def detect_nans(data: Any, fields: tuple[str, ...] = CHECKED_FIELDS) -> torch.Tensor:
+        """Return a bool tensor (N,): which environments have NaN or infinite values.
+
+        `data` is anything with the checked fields as (N, ...) tensors, such as `sim.data`. Does
+        not wait for the GPU.
+        """
+        invalid = None
+        for name in fields:
+            values = getattr(data, name)
+            # The sum over a row is finite only if all its values are, unless it overflows; the
+            # product with zero keeps NaN and turns infinities into it, and never overflows.
+            bad = (values.flatten(1) * 0).sum(dim=1) != 0
+            invalid = bad if invalid is None else invalid | bad
+        if invalid is None:
+            raise ValueError("detect_nans needs at least one field to check.")
+        return invalid
+
+    def _state_fields(self) -> list[str]:
+        mocap = _MOCAP_STATE if self.mj_model.nmocap else ()
+        sizes = {"act": self.mj_model.na, "history": self.mj_model.nhistory}
+        return [name for name in (*_PHYSICS_STATE, *mocap) if sizes.get(name, 1)]
+
+    def _input_fields(self) -> list[str]:
+        return [name for name in _INPUTS if name != "ctrl" or self.mj_model.nu]
+
+    def _dump(self, nan_ids: list[int]) -> Path:
+        import mujoco
+        import numpy as np
+
+        ids = nan_ids[: self.cfg.max_envs_to_dump]
+        stamp = datetime.now().strftime("%Y%m%d_%H%M%S")
+        folder = Path(self.cfg.output_dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        path, model_path = (
+            folder / f"nan_dump_{stamp}.npz",
+            folder / f"model_{stamp}.mjb",
+        )
+        arrays = self._recorded(ids)
+        if self.model_fields is not None:
+            for name, values in self.model_fields().items():
+                arrays[f"model_{name}"] = values[ids].cpu().numpy()
+        arrays["_metadata"] = np.array(json.dumps(self._metadata(nan_ids, ids, stamp, model_path)))
+        mujoco.mj_saveModel(self.mj_model, str(model_path))
+        partial = path.with_suffix(".partial.npz")
+        np.savez_compressed(partial, **arrays)
+        partial.replace(path)
+        _link(folder / "nan_dump_latest.npz", path)
+        _link(folder / "model_latest.mjb", model_path)
+        return path
+
+    def _recorded(self, ids: list[int]) -> dict[str, Any]:
+        """Return the arrays of the kept substeps, the state in the order of `mj_setState`."""
+        import numpy as np
+
+        arrays: dict[str, Any] = {}
+        first = self._steps - len(self.buffer)
+        for step, kept in enumerate(self.buffer, start=first):
+            rows = [
+                kept[name][ids].flatten(1).cpu().numpy().astype(np.float64)
+                for name in self._state_fields()
+            ]
+            arrays[f"states_step_{step:06d}"] = np.concatenate(rows, axis=1)
+            for name in self._input_fields():
+                arrays[f"{name}_step_{step:06d}"] = kept[name][ids].cpu().numpy()
+        return arrays
+
+    def _metadata(
+        self, nan_ids: list[int], ids: list[int], stamp: str, model_path: Path
+    ) -> dict[str, Any]:
+        import mujoco
+
+        return {
+            "format": _FORMAT,
+            "num_envs_total": self.num_envs,
+            "num_envs_dumped": len(ids),
+            "nan_env_ids": nan_ids,
+            "dumped_env_ids": ids,
+            "state_spec": state_spec(self.mj_model),
+            "state_size": mujoco.mj_stateSize(self.mj_model, state_spec(self.mj_model)),
+            "buffer_size": self.cfg.buffer_size,
+            "detection_step": self._steps,
+            "timestamp": stamp,
+            "model_file": model_path.name,
+            "note": (
+                "States are those before each substep; the last one led to the NaN. Arrays "
+                "model_<field> hold the dumped environments' own values, which the model file, as "
+                "compiled, does not."
+            ),
+        }
+
+
+def state_spec(mj_model: mujoco.MjModel) -> int:
+    """Return the `mjtState` bits that a dump of `mj_model` holds: physics, and mocap if any."""
+    import mujoco
+
+    spec = int(mujoco.mjtState.mjSTATE_PHYSICS)
+    if mj_model.nmocap:
+        mocap = mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
+        spec |= int(mocap)
+    return spec
+
+
+@dataclass
+class NanDump:
+    """A dump read back: what `NanGuard` wrote, ready for replay."""
+
+    metadata: dict[str, Any]
+    """See `NanGuard`; `dumped_env_ids` names the environments of the arrays' rows."""
+    model_file: Path
+    """The compiled model, next to the dump."""
+    steps: list[int]
+    """Indices of the kept substeps, rising."""
+    arrays: dict[str, np.ndarray[Any, Any]]
+    """`states_step_*`, `ctrl_step_*`, `xfrc_applied_step_*` and `model_*`."""
+
+    @classmethod
+    def load(cls, path: str | Path) -> NanDump:
+        """Read a dump; nothing in the file is executed.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: a file that is not such a dump.
+        """
+        import numpy as np
+
+        path = Path(path).resolve()
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
+            metadata = json.loads(str(arrays.pop("_metadata")))
+            model_file = path.parent / Path(metadata["model_file"]).name
+        except FileNotFoundError:
+            raise
+        except (KeyError, ValueError, TypeError, OSError) as error:
+            raise ValueError(
+                f"{path} is not a NaN dump of this version of mjlab: {error}."
+            ) from error
+        steps = sorted(int(name[-6:]) for name in arrays if name.startswith("states_step_"))
+        return cls(metadata=metadata, model_file=model_file, steps=steps, arrays=arrays)
+
+    def apply(self, step: int, row: int, mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
+        """Write one environment's recorded values into a host model and data; no forward pass.
+
+        `step` is one of `steps`, `row` an index into `metadata["dumped_env_ids"]`.
+
+        Raises:
+            ValueError: a substep or row that the dump does not hold.
+        """
+        import mujoco
+
+        if step not in self.steps or not 0 <= row < self.metadata["num_envs_dumped"]:
+            raise ValueError(
+                f"The dump holds substeps {self.steps[0]} to {self.steps[-1]} of "
+                f"{self.metadata['num_envs_dumped']} environments; asked for substep {step} of row "
+                f"{row}."
+            )
+        state = self.arrays[f"states_step_{step:06d}"][row]
+        mujoco.mj_setState(mj_model, mj_data, state, self.metadata["state_spec"])
+        for name in _INPUTS:
+            values = self.arrays.get(f"{name}_step_{step:06d}")
+            if values is not None:
+                getattr(mj_data, name)[:] = values[row]
+        for name, values in self.arrays.items():
+            if name.startswith("model_"):
+                _write_model_field(mj_model, name.removeprefix("model_"), values[row])
+
+
+def _write_model_field(mj_model: mujoco.MjModel, name: str, value: Any) -> None:
+    owner: Any = mj_model if hasattr(mj_model, name) else mj_model.opt
+    present = getattr(owner, name)
+    if getattr(present, "shape", ()):
+        present[:] = value.reshape(present.shape)
+    else:
+        setattr(owner, name, value.item())
+
+
+def _link(link: Path, target: Path) -> None:
+    """Let `link` name `target`, by a copy where the file system has no links."""
+    link.unlink(missing_ok=True)
+    try:
+        os.symlink(target.name, link)
+    except OSError:
+        shutil.copyfile(target, link)

@@ -1,0 +1,157 @@
+"""Kinds of noise, as configs that apply themselves, and configs of noise models."""
+
+from __future__ import annotations
+
+import functools
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import torch
+
+from mjlab.utils.noise.noise_model import NoiseModel, NoiseModelWithAdditiveBias
+
+NoiseParam = float | tuple[float, ...]
+"""One value, or one for each entry of the last axis of the data."""
+
+_OPERATIONS = ("add", "scale", "abs")
+
+
+@dataclass(kw_only=True)
+class NoiseCfg(ABC):
+    """Noise n on data x. Configs hold no state: an edited field counts from the next call on."""
+
+    operation: Literal["add", "scale", "abs"] = "add"
+    """add: x + n; scale: x * n; abs: n, whatever x is."""
+
+    def __post_init__(self) -> None:
+        self._check_operation()
+
+    @abstractmethod
+    def apply(self, data: torch.Tensor) -> torch.Tensor:
+        """Return a new tensor of the shape of `data`: the data with noise."""
+
+    def _combine(self, data: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """Combine into `noise`, a new tensor of the shape of `data`, which is given away."""
+        if self.operation == "add":
+            return noise.add_(data)
+        if self.operation == "scale":
+            return noise.mul_(data)
+        self._check_operation()
+        return noise
+
+    def _check_operation(self) -> None:
+        if self.operation not in _OPERATIONS:
+            raise ValueError(
+                f"{type(self).__name__}.operation is {self.operation!r}; "
+                f"it must be one of {list(_OPERATIONS)}."
+            )
+
+
+@dataclass
+class ConstantNoiseCfg(NoiseCfg):
+    """The same offset (or factor, or value) always."""
+
+    bias: NoiseParam = 0.0
+    """n, one value or one for each component."""
+
+    def apply(self, data: torch.Tensor) -> torch.Tensor:
+        """Return the data with n = bias."""
+        return self._combine(data, torch.zeros_like(data).add_(_param(self.bias, data)))
+
+
+@dataclass
+class UniformNoiseCfg(NoiseCfg):
+    """Uniform noise, drawn for each element."""
+
+    n_min: NoiseParam = -1.0
+    """Smallest n, one value or one for each component."""
+    n_max: NoiseParam = 1.0
+    """Bound of n from above, which n does not reach."""
+
+    def __post_init__(self) -> None:
+        """Raise `ValueError` unless n_min < n_max (components of tuples may be equal)."""
+        super().__post_init__()
+        if not _in_order(self.n_min, self.n_max):
+            raise ValueError(
+                f"UniformNoiseCfg has n_min={self.n_min} and n_max={self.n_max}; "
+                "n_min must be less than n_max."
+            )
+
+    def apply(self, data: torch.Tensor) -> torch.Tensor:
+        """Return the data with n uniform in [n_min, n_max)."""
+        low, high = _param(self.n_min, data), _param(self.n_max, data)
+        return self._combine(data, torch.rand_like(data).mul_(high - low).add_(low))
+
+
+@dataclass
+class GaussianNoiseCfg(NoiseCfg):
+    """Normally distributed noise, drawn for each element."""
+
+    mean: NoiseParam = 0.0
+    """Mean of n, one value or one for each component."""
+    std: NoiseParam = 1.0
+    """Standard deviation of n, one value or one for each component."""
+
+    def __post_init__(self) -> None:
+        """Raise `ValueError` unless std is positive (components of tuples may be 0)."""
+        super().__post_init__()
+        if not _in_order(0.0, self.std):
+            raise ValueError(f"GaussianNoiseCfg.std is {self.std}; it must be positive.")
+
+    def apply(self, data: torch.Tensor) -> torch.Tensor:
+        """Return the data with n = mean + std z, z standard normal."""
+        noise = torch.randn_like(data).mul_(_param(self.std, data))
+        return self._combine(data, noise.add_(_param(self.mean, data)))
+
+
+@dataclass(kw_only=True)
+class NoiseModelCfg:
+    """Config of a noise model, of which one is made for each observation term.
+
+    The class it builds is given as a class keyword: `class MyCfg(NoiseModelCfg, class_type=My)`.
+    """
+
+    class_type: ClassVar[type[NoiseModel]] = NoiseModel
+    """The model, made as `class_type(cfg, num_envs, device)`."""
+
+    noise_cfg: NoiseCfg
+    """Noise applied at each call."""
+
+    def __init_subclass__(cls, class_type: type[NoiseModel] | None = None, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if class_type is not None:
+            cls.class_type = class_type
+
+
+@dataclass(kw_only=True)
+class NoiseModelWithAdditiveBiasCfg(NoiseModelCfg, class_type=NoiseModelWithAdditiveBias):
+    """Noise at each call, plus a bias that is drawn at reset and kept until the next."""
+
+    bias_noise_cfg: NoiseCfg | None = None
+    """The bias: this noise applied to zero. Required."""
+    sample_bias_per_component: bool = True
+    """Each component has a bias of its own; False: one for all components of an environment."""
+
+
+def _param(value: Any, data: torch.Tensor) -> Any:
+    """Return a parameter as a number, or as a tensor that broadcasts on the last axis."""
+    if isinstance(value, (int, float)):
+        return value
+    if isinstance(value, torch.Tensor):
+        return value.to(data)
+    return _tensor_of(tuple(value), data.dtype, data.device)
+
+
+@functools.lru_cache(maxsize=256)
+def _tensor_of(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    # Cached by value, so that a step copies nothing to the device and edited configs are seen.
+    # An inference tensor could not take part in later computations with gradients.
+    with torch.inference_mode(False):
+        return torch.tensor(values, dtype=dtype, device=device)
+
+
+def _in_order(low: Any, high: Any) -> bool:
+    if isinstance(low, (int, float)) and isinstance(high, (int, float)):
+        return low < high
+    return bool((torch.as_tensor(low) <= torch.as_tensor(high)).all())

@@ -1,0 +1,200 @@
+"""Files of a run: readable YAML of its configs, and the search for a checkpoint."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import enum
+import functools
+import os
+import re
+import tempfile
+from collections.abc import Generator, Mapping
+from pathlib import Path
+from typing import Any
+
+from mjlab.compat import older_names
+from mjlab.utils.string import qualified_name
+
+_WANDB_CACHE = "wandb_checkpoints"
+_WANDB_CHECKPOINT = re.compile(r"model_(\d+)\.pt")
+
+
+def dump_yaml(filename: Path, data: dict[str, Any], sort_keys: bool = False) -> None:
+    """Write `data` as plain YAML that `yaml.safe_load` reads.
+
+    Dataclasses become mappings, tuples, arrays and tensors lists, enum members their names, and
+    functions and classes "module:name". Missing folders are made, and the suffix ".yaml" is added
+    unless the name has it (or ".yml"). The file appears whole or not at all.
+    """
+    import yaml
+
+    filename = Path(filename)
+    if filename.suffix not in (".yaml", ".yml"):
+        filename = filename.with_name(filename.name + ".yaml")
+    filename.parent.mkdir(parents=True, exist_ok=True)
+
+    class PlainDumper(yaml.SafeDumper):
+        # An object reached twice is written twice: anchors are hard to read.
+        def ignore_aliases(self, data: Any) -> bool:
+            return True
+
+    text = yaml.dump(
+        to_plain(data),
+        Dumper=PlainDumper,
+        sort_keys=sort_keys,
+        default_flow_style=False,
+    )
+    with _replacing(filename) as temporary:
+        temporary.write_text(text)
+
+
+def to_plain(value: Any, _parents: tuple[int, ...] = ()) -> Any:
+    """Return `value` as dicts, lists, strings, numbers, booleans and None."""
+    if isinstance(value, enum.Enum):
+        return value.name
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return _plain_scalar(value)
+    if id(value) in _parents:
+        return "<contains itself>"
+    inner = (*_parents, id(value))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        # Fields are read one by one: `asdict` copies, which not every value allows.
+        return {f.name: to_plain(getattr(value, f.name), inner) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {_plain_key(key): to_plain(item, inner) for key, item in value.items()}
+    if isinstance(value, (set, frozenset)):
+        return sorted((to_plain(item, inner) for item in value), key=str)
+    if isinstance(value, (list, tuple)):
+        return [to_plain(item, inner) for item in value]
+    if isinstance(value, functools.partial):
+        return {
+            "func": to_plain(value.func, inner),
+            "args": to_plain(value.args, inner),
+            "keywords": to_plain(value.keywords, inner),
+        }
+    return _plain_object(value)
+
+
+def _plain_scalar(value: Any) -> Any:
+    # Subclasses (numpy's float64 among them) are unknown to the safe dumper.
+    for kind in (bool, int, float, str):
+        if isinstance(value, kind):
+            return kind(value)
+    return None
+
+
+def _plain_key(key: Any) -> Any:
+    plain = to_plain(key)
+    return plain if isinstance(plain, (bool, int, float, str, type(None))) else str(key)
+
+
+def _plain_object(value: Any) -> Any:
+    # Arrays, tensors and numpy scalars; a class has the method too, but no values.
+    if hasattr(value, "tolist") and not isinstance(value, type):
+        return value.tolist()
+    if callable(value):
+        return qualified_name(value)
+    if isinstance(value, (os.PathLike, slice)) or type(value).__module__ == "torch":
+        return str(value)
+    # The default `repr` shows a memory address, which differs from run to run.
+    if type(value).__repr__ is object.__repr__ or type(value).__module__.startswith("mujoco"):
+        return f"<{qualified_name(type(value))}>"
+    return repr(value)
+
+
+def get_checkpoint_path(
+    log_path: Path, run_dir: str = ".*", checkpoint: str = ".*", sort_alpha: bool = True
+) -> Path:
+    """Return the newest checkpoint of the newest run that has one.
+
+    Args:
+        log_path: Folder of the experiment; its sub-folders are runs.
+        run_dir: Regular expression for the name of the run. Runs matched in full are preferred to
+            those of which it matches only the start.
+        checkpoint: Regular expression for the whole name of the checkpoint file.
+        sort_alpha: The newest run is the last by name; False: the one changed last.
+
+    The newest checkpoint of a run is the one with the highest number in its name. Raises
+    `ValueError`, saying what there is, if the folder, a matching run or a checkpoint is missing.
+    """
+    log_path = Path(log_path)
+    if not log_path.is_dir():
+        raise ValueError(f"There is no log folder {str(log_path)!r}. Has the task been trained?")
+    folders = [p for p in log_path.iterdir() if p.is_dir() and p.name != _WANDB_CACHE]
+    folders.sort(key=lambda p: p.name if sort_alpha else (p.stat().st_mtime_ns, p.name))
+    runs = [p for p in folders if re.fullmatch(run_dir, p.name)]
+    runs = runs or [p for p in folders if re.match(run_dir, p.name)]
+    if not runs:
+        raise ValueError(
+            f"No run in {str(log_path)!r} matches {run_dir!r}. "
+            f"Runs there: {[p.name for p in folders]}."
+        )
+    for run in reversed(runs):
+        files = [p for p in run.iterdir() if p.is_file() and re.fullmatch(checkpoint, p.name)]
+        if files:
+            return max(files, key=_checkpoint_age)
+    raise ValueError(
+        f"No file matching {checkpoint!r} in any of the runs {[p.name for p in runs]} of "
+        f"{str(log_path)!r}."
+    )
+
+
+def _checkpoint_age(path: Path) -> tuple[bool, int, str]:
+    numbers = re.findall(r"\d+", path.stem)
+    # Event files have long numbers in their names too: a ".pt" file goes before all others.
+    return path.suffix == ".pt", int(numbers[-1]) if numbers else -1, path.name
+
+
+def get_wandb_checkpoint_path(
+    log_path: Path, run_path: Path, checkpoint_name: str | None = None
+) -> tuple[Path, bool]:
+    """Return a checkpoint of a Weights & Biases run, and whether it was in the cache already.
+
+    Args:
+        log_path: Folder of the experiment; the cache is `wandb_checkpoints/<run id>/` in it.
+        run_path: "entity/project/run_id".
+        checkpoint_name: File name as "model_100.pt"; None takes the highest number.
+
+    A cached file is used as it is. Raises `ValueError`, listing the checkpoints there are, if the
+    run does not have the one asked for.
+    """
+    import wandb
+
+    cache = Path(log_path) / _WANDB_CACHE / Path(run_path).name
+    if checkpoint_name is not None and _WANDB_CHECKPOINT.fullmatch(checkpoint_name):
+        cached = cache / checkpoint_name
+        if cached.is_file():
+            return cached, True
+    run = wandb.Api().run(str(run_path))
+    names = [file.name for file in run.files() if _WANDB_CHECKPOINT.fullmatch(file.name)]
+    names.sort(key=lambda name: int(name[len("model_") : -len(".pt")]))
+    if not names or (checkpoint_name is not None and checkpoint_name not in names):
+        raise ValueError(
+            f"The run {str(run_path)!r} has no checkpoint {checkpoint_name or 'model_<n>.pt'!r}. "
+            f"Checkpoints there: {names}."
+        )
+    name = checkpoint_name or names[-1]
+    target = cache / name
+    if target.is_file():
+        return target, True
+    cache.mkdir(parents=True, exist_ok=True)
+    # Downloaded next to its place and renamed, so that a broken transfer leaves nothing behind.
+    with tempfile.TemporaryDirectory(dir=cache) as folder:
+        run.file(name).download(folder, replace=True)
+        os.replace(Path(folder) / name, target)
+    return target, False
+
+
+@contextlib.contextmanager
+def _replacing(path: Path) -> Generator[Path, None, None]:
+    """Yield a temporary path that takes the place of `path` if the block succeeds."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+__getattr__ = older_names(__name__)

@@ -1,0 +1,1 @@
+"""The editors behind `mjlab.utils.spec_config`, by what they edit."""

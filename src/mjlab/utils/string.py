@@ -1,0 +1,80 @@
+"""Lenient matching of names by regular expression, used by spec editors and config dictionaries.
+
+Patterns here match at the START of a name (`re.match`), so "hip" matches "hip_b". Entity lookups
+are strict instead: see `mjlab.utils.lab_api.string.resolve_matching_names`.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+logger = logging.getLogger(__name__)
+
+
+def resolve_expr(
+    pattern_map: dict[str, Any], names: tuple[str, ...], default_val: Any = None
+) -> tuple[Any, ...]:
+    """Return, for each name, the value of the first pattern (in dict order) that matches its start.
+
+    Args:
+        pattern_map: Regular expression to value.
+        names: The names to resolve.
+        default_val: The value of a name that no pattern matches.
+
+    A pattern that matches none of the names is reported by a logged warning, because it is most
+    often a misspelling. Raises `ValueError` for a pattern that is not a regular expression.
+    """
+    compiled = [(compile_pattern(pattern), value) for pattern, value in pattern_map.items()]
+    _report_unmatched((pattern for pattern, _ in compiled), names)
+    return tuple(
+        next((value for pattern, value in compiled if pattern.match(name)), default_val)
+        for name in names
+    )
+
+
+def filter_exp(exprs: list[str] | tuple[str, ...], names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names whose start any pattern matches, in name order, duplicates kept.
+
+    Patterns that match nothing are reported by a logged warning. Raises `ValueError` for a pattern
+    that is not a regular expression.
+    """
+    compiled = [compile_pattern(expr) for expr in exprs]
+    _report_unmatched(compiled, names)
+    return tuple(name for name in names if any(pattern.match(name) for pattern in compiled))
+
+
+def resolve_field(field: Any, names: tuple[str, ...], default_val: Any = None) -> tuple[Any, ...]:
+    """Return one value for each name: `resolve_expr` of a dict, else `field` for every name."""
+    if isinstance(field, dict):
+        return resolve_expr(field, names, default_val)
+    return tuple(field for _ in names)
+
+
+def compile_pattern(pattern: str) -> re.Pattern[str]:
+    """Compile a regular expression; raise `ValueError` that quotes it if it is not one."""
+    try:
+        return re.compile(pattern)
+    except re.error as error:
+        raise ValueError(f"{pattern!r} is not a valid regular expression: {error}.") from error
+
+
+def qualified_name(value: Any) -> str:
+    """Return "module:qualified.name" of a class or function, or of the class of another value."""
+    named = value if hasattr(value, "__qualname__") else type(value)
+    # Methods of built-in classes know their class instead of their module.
+    owner = getattr(named, "__objclass__", None) or getattr(named, "__self__", None)
+    module = getattr(named, "__module__", None) or getattr(owner, "__module__", "builtins")
+    return f"{module}:{named.__qualname__}"
+
+
+def _report_unmatched(patterns: Iterable[re.Pattern[str]], names: Sequence[str]) -> None:
+    # Nothing can match where there are no names: the default pattern ".*" of an entity without
+    # joints is no mistake.
+    if not names:
+        return
+    unmatched = [p.pattern for p in patterns if not any(p.match(name) for name in names)]
+    if unmatched:
+        logger.warning("Patterns %s match none of the names %s.", unmatched, list(names))

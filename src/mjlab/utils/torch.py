@@ -1,0 +1,28 @@
+"""Settings of torch that hold for the whole process."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+
+def configure_torch_backends(allow_tf32: bool = True, deterministic: bool = False) -> None:
+    """Set precision and determinism of GPU kernels.
+
+    Args:
+        allow_tf32: Let matrix products and convolutions of float32 round to TF32, which is faster.
+        deterministic: Let cuDNN choose deterministic algorithms, and not by timing them.
+    """
+    precision = "tf32" if allow_tf32 else "ieee"
+    if hasattr(torch.backends.cuda.matmul, "fp32_precision"):
+        # The switches of torch 2.9 on. Torch refuses to mix them with the earlier ones.
+        torch.backends.cuda.matmul.fp32_precision = precision
+        cudnn: Any = torch.backends.cudnn
+        cudnn.conv.fp32_precision = precision
+        cudnn.rnn.fp32_precision = precision
+    else:
+        torch.backends.cuda.matmul.allow_tf32 = allow_tf32
+        torch.backends.cudnn.allow_tf32 = allow_tf32
+    torch.backends.cudnn.deterministic = deterministic
+    torch.backends.cudnn.benchmark = not deterministic

@@ -1,0 +1,172 @@
+"""Gains and effort limits, by kind of actuator."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from mjlab.actuator import (
+    BuiltinDcMotorActuatorCfg,
+    BuiltinMotorActuatorCfg,
+    BuiltinPdActuatorCfg,
+    BuiltinPositionActuatorCfg,
+    DcMotorDatasheetParams,
+    DcMotorInputMode,
+    IdealPdActuatorCfg,
+    XmlActuatorCfg,
+)
+from mjlab.envs.mdp import dr
+from mjlab.managers.scene_entity_config import SceneEntityCfg
+
+POSITION = BuiltinPositionActuatorCfg(
+    target_names_expr=("hip",), stiffness=20.0, damping=2.0, effort_limit=5.0
+)
+IDEAL = IdealPdActuatorCfg(
+    target_names_expr=("knee", "ankle"), stiffness=10.0, damping=1.0, effort_limit=4.0
+)
+
+
+def names(*actuator_names: str) -> SceneEntityCfg:
+    return SceneEntityCfg("robot", actuator_names=list(actuator_names))
+
+
+@pytest.mark.parametrize("engine", ["native", "warp"])
+def test_servo_gains_scale_the_defaults_and_keep_their_signs(make_world: Any, engine: str) -> None:
+    world = make_world(actuators=(POSITION, IDEAL), engine=engine)
+    for _ in range(3):
+        world.apply(
+            dr.pd_gains,
+            torch.tensor([1]),
+            kp_range=(2.0, 2.0),
+            kd_range=(3.0, 3.0),
+            asset_cfg=names("hip"),
+        )
+    model = world.sim.model
+    assert model.actuator_gainprm[:, 0, 0].tolist() == [20.0, 40.0, 20.0, 20.0]
+    assert model.actuator_biasprm[:, 0, 1].tolist() == [-20.0, -40.0, -20.0, -20.0]
+    assert model.actuator_biasprm[:, 0, 2].tolist() == [-2.0, -6.0, -2.0, -2.0]
+
+
+def test_single_actuators_are_selected_across_groups(make_world: Any) -> None:
+    # "ankle" is the third actuator, and the second target of the second group.
+    world = make_world(actuators=(POSITION, IDEAL))
+    world.apply(
+        dr.pd_gains,
+        kp_range=(7.0, 7.0),
+        kd_range=(0.5, 0.5),
+        asset_cfg=names("ankle"),
+        operation="abs",
+    )
+    ideal = world.robot.actuators[1]
+    assert ideal.stiffness[0].tolist() == [10.0, 7.0]
+    assert ideal.damping[0].tolist() == [1.0, 0.5]
+    assert world.sim.model.actuator_gainprm[0, 0, 0] == 20.0
+
+
+def test_draws_are_independent_for_each_environment_and_actuator(make_world: Any) -> None:
+    world = make_world(actuators=(POSITION, IDEAL))
+    world.apply(dr.pd_gains, kp_range=(0.5, 2.0), kd_range=(0.5, 2.0), distribution="log_uniform")
+    ideal = world.robot.actuators[1]
+    factors = torch.cat((ideal.stiffness / 10.0, ideal.damping), dim=1)
+    assert len(factors.unique()) == factors.numel()
+    assert bool(((factors >= 0.5) & (factors <= 2.0)).all())
+
+
+def test_native_pd_writes_both_elements(make_world: Any) -> None:
+    cfg = BuiltinPdActuatorCfg(
+        target_names_expr=("hip", "knee"), stiffness=8.0, damping=1.5, effort_limit=6.0
+    )
+    world = make_world(actuators=(cfg,))
+    world.apply(
+        dr.pd_gains, kp_range=(2.0, 2.0), kd_range=(4.0, 4.0), asset_cfg=names("knee_pd_.*")
+    )
+    gain, bias = world.sim.model.actuator_gainprm[0], world.sim.model.actuator_biasprm[0]
+    assert gain[:, 0].tolist() == [8.0, 16.0, 1.5, 6.0]
+    assert bias[:, 1].tolist() == [-8.0, -16.0, 0.0, 0.0]
+    assert bias[:, 2].tolist() == [0.0, 0.0, -1.5, -6.0]
+    world.apply(dr.effort_limits, effort_limit_range=(0.5, 0.5), asset_cfg=names("knee_pd_.*"))
+    ranges = world.sim.model.jnt_actfrcrange[0, 1:3].tolist()
+    assert ranges == [[-6.0, 6.0], [-3.0, 3.0]]
+
+
+def test_dc_motor_gains(make_world: Any) -> None:
+    params = DcMotorDatasheetParams(nominal_voltage=24.0, stall_torque=5.0, no_load_speed=30.0)
+    cfg = BuiltinDcMotorActuatorCfg(
+        target_names_expr=("hip",),
+        motor_params=params,
+        stiffness=12.0,
+        damping=1.0,
+        voltage_limit=24.0,
+    )
+    world = make_world(actuators=(cfg,))
+    world.apply(dr.pd_gains, kp_range=(2.0, 2.0), kd_range=(3.0, 3.0))
+    assert world.sim.model.actuator_gainprm[0, 0, 4] == 24.0
+    assert world.sim.model.actuator_gainprm[0, 0, 6] == 3.0
+    voltage = BuiltinDcMotorActuatorCfg(
+        target_names_expr=("hip",), motor_params=params, mode=DcMotorInputMode.VOLTAGE
+    )
+    with pytest.raises(ValueError, match=r"\['hip'\] are driven by voltage"):
+        make_world(actuators=(voltage,)).apply(
+            dr.pd_gains, kp_range=(1.0, 1.0), kd_range=(1.0, 1.0)
+        )
+
+
+def test_effort_limits_scale_both_ends(make_world: Any) -> None:
+    world = make_world(actuators=(POSITION,))
+    world.apply(dr.effort_limits, torch.tensor([2]), effort_limit_range=(0.5, 0.5))
+    ranges = world.sim.model.actuator_forcerange[:, 0]
+    assert ranges[2].tolist() == [-2.5, 2.5]
+    assert ranges[0].tolist() == [-5.0, 5.0]
+    world.apply(dr.effort_limits, effort_limit_range=(9.0, 9.0), operation="abs")
+    assert ranges[0].tolist() == [-9.0, 9.0]
+
+
+def test_a_larger_limit_of_an_ideal_actuator_takes_effect(make_world: Any) -> None:
+    world = make_world(actuators=(IDEAL,))
+    world.apply(
+        dr.effort_limits, torch.tensor([1]), effort_limit_range=(3.0, 3.0), asset_cfg=names("knee")
+    )
+    ideal = world.robot.actuators[0]
+    assert ideal.force_limit[1].tolist() == [12.0, 4.0]
+    assert world.sim.model.actuator_forcerange[1, :, 1].tolist() == [12.0, 4.0]
+    assert world.sim.model.actuator_ctrlrange[1, :, 0].tolist() == [-12.0, -4.0]
+    # The knee wants much more than either limit: MuJoCo's motor lets the larger one through.
+    world.robot.set_joint_position_target(torch.full((4, 3), 100.0))
+    world.robot.write_data_to_sim()
+    world.sim.step()
+    assert world.robot.data.actuator_force[:2, 0].tolist() == pytest.approx([4.0, 12.0])
+
+
+def test_kinds_without_gains_are_refused_by_name(make_world: Any) -> None:
+    world = make_world(
+        actuators=(BuiltinMotorActuatorCfg(target_names_expr=("hip",), effort_limit=3.0),)
+    )
+    with pytest.raises(TypeError, match=r"pd_gains: .*\['hip'\].*BuiltinMotorActuator"):
+        world.apply(dr.pd_gains, kp_range=(1.0, 1.0), kd_range=(1.0, 1.0))
+    with pytest.raises(TypeError, match=r"effort_limits: .*\['hip'\].*BuiltinMotorActuator"):
+        world.apply(dr.effort_limits, effort_limit_range=(1.0, 1.0))
+
+
+def test_only_scale_and_abs_are_known(make_world: Any) -> None:
+    world = make_world(actuators=(POSITION,))
+    with pytest.raises(ValueError, match="pd_gains knows the operations 'scale' and 'abs'"):
+        world.apply(dr.pd_gains, kp_range=(1.0, 1.0), kd_range=(1.0, 1.0), operation="add")
+
+
+def with_actuator(element: str) -> str:
+    return f"""<mujoco><worldbody><body name="cart"><joint name="slider" type="slide"/>
+    <geom size=".1"/></body></worldbody><actuator>{element}</actuator></mujoco>"""
+
+
+def test_xml_position_actuators_have_gains_and_xml_motors_have_none(make_world: Any) -> None:
+    position = with_actuator('<position name="drive" joint="slider" kp="50" kv="5"/>')
+    world = make_world(position, actuators=(XmlActuatorCfg(target_names_expr=("slider",)),))
+    world.apply(dr.pd_gains, kp_range=(2.0, 2.0), kd_range=(2.0, 2.0))
+    assert world.sim.model.actuator_gainprm[0, 0, 0] == 100.0
+    assert world.sim.model.actuator_biasprm[0, 0, 2] == -10.0
+    motor = with_actuator('<motor name="drive" joint="slider"/>')
+    world = make_world(motor, actuators=(XmlActuatorCfg(target_names_expr=("slider",)),))
+    with pytest.raises(TypeError, match="XmlActuator with command field 'effort'"):
+        world.apply(dr.pd_gains, kp_range=(2.0, 2.0), kd_range=(2.0, 2.0))

@@ -1,0 +1,62 @@
+"""Distributions and operations."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mjlab.envs.mdp.dr import Distribution, Operation
+from mjlab.envs.mdp.dr._types import draw, resolve_distribution, resolve_operation
+
+
+@given(
+    name=st.sampled_from(["uniform", "log_uniform", "gaussian"]),
+    shape=st.tuples(st.integers(2, 5), st.integers(2, 5)),
+)
+def test_every_element_is_drawn_for_itself(name: str, shape: tuple[int, int]) -> None:
+    sample = draw(resolve_distribution(name), (0.5, 2.0), shape, "cpu")
+    assert sample.shape == shape
+    assert len(sample.unique()) == sample.numel()
+
+
+def test_gaussian_takes_mean_and_deviation() -> None:
+    torch.manual_seed(0)
+    sample = draw(resolve_distribution("gaussian"), (3.0, 0.5), (20000,), "cpu")
+    assert sample.mean() == pytest.approx(3.0, abs=0.02)
+    assert sample.std() == pytest.approx(0.5, abs=0.02)
+
+
+@given(st.floats(-5.0, 5.0, width=32))
+def test_equal_log_uniform_bounds_are_a_constant(value: float) -> None:
+    sample = draw(resolve_distribution("log_uniform"), (value, value), (3,), "cpu")
+    assert torch.equal(sample, torch.full((3,), value))
+
+
+@pytest.mark.parametrize("bounds", [(0.0, 1.0), (-1.0, 1.0)])
+def test_log_uniform_refuses_bounds_at_or_below_zero(bounds: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="log_uniform needs bounds above 0"):
+        draw(resolve_distribution("log_uniform"), bounds, (3,), "cpu")
+
+
+def test_gaussian_refuses_a_negative_deviation() -> None:
+    with pytest.raises(ValueError, match="must not be negative"):
+        draw(resolve_distribution("gaussian"), (0.0, -1.0), (3,), "cpu")
+
+
+def test_unknown_names_list_the_valid_ones_and_instances_pass() -> None:
+    with pytest.raises(ValueError, match=r"Unknown distribution 'normal'.*gaussian.*log_uniform"):
+        resolve_distribution("normal")
+    with pytest.raises(ValueError, match=r"Unknown operation 'mul'.*abs.*add.*scale"):
+        resolve_operation("mul")
+    mine = Operation("max", torch.zeros_like, torch.maximum, uses_defaults=True)
+    assert resolve_operation(mine) is mine
+    ours = Distribution("zero", lambda lower, upper, shape, device: torch.zeros(shape))
+    assert resolve_distribution(ours) is ours
+
+
+def test_a_distribution_of_the_wrong_shape_is_refused() -> None:
+    scalar = Distribution("scalar", lambda lower, upper, shape, device: lower)
+    with pytest.raises(ValueError, match="'scalar' returned shape"):
+        draw(scalar, (0.0, 1.0), (2, 2), "cpu")

@@ -1,0 +1,142 @@
+"""Reward, metric and termination terms against their formulas."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from mjlab.actuator import IdealPdActuatorCfg
+from mjlab.envs.mdp import metrics, rewards, terminations
+from mjlab.managers.reward_manager import RewardTermCfg
+from mjlab.managers.scene_entity_config import SceneEntityCfg
+
+
+def resolved(world: Any, **kwargs: Any) -> SceneEntityCfg:
+    cfg = SceneEntityCfg("robot", **kwargs)
+    cfg.resolve(world.scene)
+    return cfg
+
+
+@pytest.fixture
+def moving(make_world: Any) -> Any:
+    pd = IdealPdActuatorCfg(target_names_expr=("hip", "knee"), stiffness=10.0, damping=1.0)
+    world = make_world(actuators=(pd,))
+    world.sim.data.qpos[:, 7:] = torch.tensor([[0.1, 0.2, 0.3], [0.95, -3.0, 0.0]] * 2)
+    world.sim.data.qvel[:, 6:] = torch.tensor([[1.0, -2.0, 3.0]] * 4)
+    world.robot.set_joint_effort_target(torch.tensor([[0.5, -5.0, 0.0]] * 4))
+    world.robot.write_data_to_sim()
+    world.sim.forward()
+    return world
+
+
+def test_termination_rewards_do_not_count_time_outs() -> None:
+    terminated = torch.tensor([True, False, False])
+    manager = SimpleNamespace(terminated=terminated, time_outs=torch.tensor([False, True, False]))
+    env: Any = SimpleNamespace(termination_manager=manager)
+    assert rewards.is_alive(env).tolist() == [0.0, 1.0, 1.0]
+    assert rewards.is_terminated(env).tolist() == [1.0, 0.0, 0.0]
+
+
+def test_sums_of_squares(moving: Any) -> None:
+    data = moving.robot.data
+    last = resolved(moving, joint_names=("knee", "ankle"))
+    torch.testing.assert_close(rewards.joint_vel_l2(moving), torch.full((4,), 14.0))
+    torch.testing.assert_close(rewards.joint_vel_l2(moving, last), torch.full((4,), 13.0))
+    expected = (data.joint_acc[:, 1:] ** 2).sum(1)
+    torch.testing.assert_close(rewards.joint_acc_l2(moving, last), expected)
+    force = data.actuator_force
+    assert bool((force[:, 1] != 0.0).all())
+    knee = resolved(moving, actuator_names=["knee"])
+    torch.testing.assert_close(rewards.joint_torques_l2(moving, knee), force[:, 1] ** 2)
+
+
+def test_limits_count_what_is_beyond_the_soft_ones(moving: Any) -> None:
+    # Soft limits are 0.9 of (-1, 1) and of (-2, 0.5); the ankle has none.
+    expected = torch.tensor([0.0, 0.05 + (3.0 - 1.875), 0.0, 0.05 + (3.0 - 1.875)])
+    torch.testing.assert_close(rewards.joint_pos_limits(moving), expected)
+
+
+def test_power_counts_driving_and_not_braking(moving: Any) -> None:
+    data = moving.robot.data
+    expected = (data.qfrc_actuator * data.joint_vel).clamp(min=0.0).sum(1)
+    term = rewards.electrical_power_cost(RewardTermCfg(func=None, weight=1.0), moving)
+    cost = term(moving, resolved(moving, joint_names=(".*",)))
+    torch.testing.assert_close(cost, expected)
+    assert bool((cost > 0.0).any())
+    assert bool((data.qfrc_actuator * data.joint_vel < 0.0).any())
+
+
+def test_action_terms_are_differences_of_raw_actions() -> None:
+    manager = SimpleNamespace(
+        action=torch.tensor([[3.0, 1.0]]),
+        prev_action=torch.tensor([[1.0, 1.0]]),
+        prev_prev_action=torch.tensor([[0.0, 2.0]]),
+    )
+    env: Any = SimpleNamespace(action_manager=manager)
+    assert rewards.action_rate_l2(env).tolist() == [4.0]
+    assert rewards.action_acc_l2(env).tolist() == [2.0]
+    assert metrics.mean_action_acc(env).tolist() == [1.0]
+
+
+# posture
+
+
+def posture(world: Any, std: dict[str, float], **kwargs: Any) -> torch.Tensor:
+    params = {"std": std, "asset_cfg": resolved(world, **kwargs)}
+    term = rewards.posture(RewardTermCfg(func=rewards.posture, weight=1.0, params=params), world)
+    return term(world, **params)
+
+
+@pytest.mark.parametrize("preserve_order", [False, True])
+def test_posture_pairs_each_joint_with_its_own_deviation(moving: Any, preserve_order: bool) -> None:
+    std = {"hip": 0.5, "knee": 2.0}
+    value = posture(moving, std, joint_names=("knee", "hip"), preserve_order=preserve_order)
+    expected = math.exp(-0.5 * ((0.1 / 0.5) ** 2 + (0.2 / 2.0) ** 2))
+    assert value[0].item() == pytest.approx(expected)
+
+
+def test_posture_wants_every_joint_covered(moving: Any) -> None:
+    with pytest.raises(ValueError, match=r"no entry for the joints \['ankle'\]"):
+        posture(moving, {"hip": 0.5, "knee": 2.0}, joint_names=(".*",))
+    with pytest.raises(ValueError, match="joint_names must be set"):
+        posture(moving, {".*": 0.5})
+    with pytest.raises(ValueError, match="elbow"):
+        posture(moving, {".*": 0.5, "elbow": 1.0}, joint_names=(".*",))
+
+
+# Orientation, height, time
+
+
+def test_tilt_of_the_root(make_world: Any) -> None:
+    world = make_world()
+    angle = torch.tensor([0.0, 0.5, 1.0, 3.1])
+    world.sim.data.qpos[:, 3] = torch.cos(angle / 2)
+    world.sim.data.qpos[:, 4] = torch.sin(angle / 2)
+    world.sim.data.qpos[:, 2] = torch.tensor([0.1, 0.2, 0.3, 0.4])
+    world.sim.forward()
+    torch.testing.assert_close(
+        rewards.flat_orientation_l2(world), torch.sin(angle) ** 2, atol=1e-5, rtol=1e-4
+    )
+    fallen = terminations.bad_orientation(world, limit_angle=0.7)
+    assert fallen.tolist() == [False, False, True, True]
+    low = terminations.root_height_below_minimum(world, minimum_height=0.25)
+    assert low.tolist() == [True, True, False, False]
+
+
+def test_time_out_is_reached_at_the_maximum_length(make_world: Any) -> None:
+    world = make_world()
+    world.episode_length_buf[:] = torch.tensor([0, 9, 10, 11])
+    assert terminations.time_out(world).tolist() == [False, False, True, True]
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_nan_detection_sees_positions_and_velocities(make_world: Any, bad: float) -> None:
+    world = make_world()
+    assert not terminations.nan_detection(world).any()
+    world.sim.data.qpos[1, 8] = bad
+    world.sim.data.qvel[2, 0] = bad
+    assert terminations.nan_detection(world).tolist() == [False, True, True, False]

@@ -1,0 +1,226 @@
+"""YAML of configs, and the search for checkpoints."""
+
+from __future__ import annotations
+
+import enum
+import functools
+import math
+import os
+import sys
+import types
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from mjlab.utils.os import dump_yaml, get_checkpoint_path, get_wandb_checkpoint_path
+
+
+class Color(enum.IntEnum):
+    RED = 1
+
+
+@dataclass
+class Inner:
+    func: object = math.sqrt
+    limits: tuple[float, float] = (-math.inf, 1e-5)
+
+
+@dataclass
+class Outer:
+    inner: Inner = field(default_factory=Inner)
+    again: Inner | None = None
+    color: Color = Color.RED
+    by_color: dict = field(default_factory=lambda: {Color.RED: (1, 2)})
+    values: object = None
+
+
+def _dumped(tmp_path: Path, data: object) -> dict:
+    dump_yaml(tmp_path / "out.yaml", {"data": data})
+    return yaml.safe_load((tmp_path / "out.yaml").read_text())["data"]
+
+
+def test_configs_become_plain_yaml(tmp_path):
+    inner = Inner()
+    loaded = _dumped(tmp_path, Outer(inner=inner, again=inner))
+    plain = {"func": "math:sqrt", "limits": [-math.inf, 1e-5]}
+    assert loaded["inner"] == loaded["again"] == plain
+    assert loaded["color"] == "RED"
+    assert loaded["by_color"] == {"RED": [1, 2]}
+    text = (tmp_path / "out.yaml").read_text()
+    assert "!" not in text
+    assert "&" not in text
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (np.float32(0.5), 0.5),
+        (np.float64(0.25), 0.25),
+        (np.bool_(True), True),
+        (np.arange(3), [0, 1, 2]),
+        (torch.ones(2), [1.0, 1.0]),
+        (torch.float32, "torch.float32"),
+        (slice(1, None), "slice(1, None, None)"),
+        (Path("a/b"), "a/b"),
+        ({"b", "a"}, ["a", "b"]),
+        (Inner, f"{__name__}:Inner"),
+        (math.pi, math.pi),
+        ("1e-3", "1e-3"),
+        (mujoco.MjSpec(), "<mujoco._specs:MjSpec>"),
+        (
+            functools.partial(math.pow, 2, y=Inner),
+            {"func": "math:pow", "args": [2], "keywords": {"y": f"{__name__}:Inner"}},
+        ),
+    ],
+)
+def test_values_of_many_kinds_can_be_read_back(tmp_path, value, expected):
+    loaded = _dumped(tmp_path, value)
+    assert loaded == expected
+    assert type(loaded) is type(expected)
+
+
+def test_a_lambda_is_named_by_its_place(tmp_path):
+    assert _dumped(tmp_path, lambda: 0).endswith("<lambda>")
+
+
+def test_what_contains_itself_ends(tmp_path):
+    data = {"a": 1}
+    data["self"] = data
+    assert _dumped(tmp_path, data)["self"] == "<contains itself>"
+
+
+def test_suffix_and_folders_are_added_and_order_is_kept(tmp_path):
+    dump_yaml(tmp_path / "x" / "params" / "env.v1", {"b": 1, "a": 2})
+    text = (tmp_path / "x" / "params" / "env.v1.yaml").read_text()
+    assert text == "b: 1\na: 2\n"
+    dump_yaml(tmp_path / "sorted", {"b": 1, "a": 2}, sort_keys=True)
+    assert (tmp_path / "sorted.yaml").read_text() == "a: 2\nb: 1\n"
+
+
+def test_a_failing_write_leaves_the_previous_file(tmp_path, monkeypatch):
+    dump_yaml(tmp_path / "a.yaml", {"old": 1})
+
+    def full_disk(self, text):
+        self.touch()
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full_disk)
+    with pytest.raises(OSError, match="No space"):
+        dump_yaml(tmp_path / "a.yaml", {"new": 2})
+    monkeypatch.undo()
+    assert os.listdir(tmp_path) == ["a.yaml"]
+    assert yaml.safe_load((tmp_path / "a.yaml").read_text()) == {"old": 1}
+
+
+def _make_run(root: Path, name: str, *files: str) -> None:
+    (root / name).mkdir(parents=True)
+    for file in files:
+        (root / name / file).touch()
+
+
+def test_the_newest_run_and_the_highest_iteration_are_taken(tmp_path):
+    _make_run(tmp_path, "2025-01-01", "model_5.pt")
+    _make_run(tmp_path, "2025-01-02", "model_9.pt", "model_100.pt")
+    _make_run(tmp_path, "wandb_checkpoints", "model_7.pt")
+    assert get_checkpoint_path(tmp_path) == tmp_path / "2025-01-02" / "model_100.pt"
+    older = get_checkpoint_path(tmp_path, run_dir="2025-01-01")
+    assert older == tmp_path / "2025-01-01" / "model_5.pt"
+
+
+def test_a_million_iterations_come_after_999999(tmp_path):
+    _make_run(tmp_path, "run", "model_999999.pt", "model_1000000.pt")
+    assert get_checkpoint_path(tmp_path).name == "model_1000000.pt"
+
+
+def test_a_half_written_file_is_no_checkpoint(tmp_path):
+    _make_run(tmp_path, "run", "model_1.pt", "model_2.pt.tmp")
+    assert get_checkpoint_path(tmp_path, checkpoint=r"model_.*\.pt").name == "model_1.pt"
+    _make_run(tmp_path, "run_without", "model_3.pt.tmp")
+    assert get_checkpoint_path(tmp_path, checkpoint=r"model_.*\.pt").name == "model_1.pt"
+
+
+def test_event_files_do_not_hide_checkpoints(tmp_path):
+    _make_run(tmp_path, "run", "model_1.pt", "events.out.tfevents.1700000000")
+    assert get_checkpoint_path(tmp_path).name == "model_1.pt"
+
+
+def test_runs_without_a_checkpoint_are_passed_over(tmp_path):
+    _make_run(tmp_path, "a", "model_1.pt")
+    _make_run(tmp_path, "b")
+    assert get_checkpoint_path(tmp_path, checkpoint="model_.*").parent.name == "a"
+
+
+def test_a_run_named_in_full_goes_before_those_it_is_the_start_of(tmp_path):
+    _make_run(tmp_path, "2025", "model_1.pt")
+    _make_run(tmp_path, "2025_test", "model_1.pt")
+    assert get_checkpoint_path(tmp_path, run_dir="2025").parent.name == "2025"
+    assert get_checkpoint_path(tmp_path, run_dir="202").parent.name == "2025_test"
+
+
+def test_runs_can_be_sorted_by_time(tmp_path):
+    _make_run(tmp_path, "b", "model_1.pt")
+    _make_run(tmp_path, "a", "model_1.pt")
+    os.utime(tmp_path / "b", (1, 1))
+    assert get_checkpoint_path(tmp_path, sort_alpha=False).parent.name == "a"
+    assert get_checkpoint_path(tmp_path).parent.name == "b"
+
+
+def test_what_is_missing_is_named(tmp_path):
+    with pytest.raises(ValueError, match="no log folder .*nowhere"):
+        get_checkpoint_path(tmp_path / "nowhere")
+    _make_run(tmp_path, "first")
+    with pytest.raises(ValueError, match=r"matches 'second'. Runs there: \['first'\]"):
+        get_checkpoint_path(tmp_path, run_dir="second")
+    with pytest.raises(ValueError, match=r"'model_3.pt' in any of the runs \['first'\]"):
+        get_checkpoint_path(tmp_path, checkpoint="model_3.pt")
+
+
+class FakeWandbFile:
+    def __init__(self, name: str, fails: bool = False) -> None:
+        self.name = name
+        self.fails = fails
+
+    def download(self, root: str, replace: bool = False) -> None:
+        (Path(root) / self.name).write_text(self.name)
+        if self.fails:
+            raise ConnectionError
+
+
+@pytest.fixture
+def wandb_files(monkeypatch):
+    """The files of the only run of a made-up server; without it, asking the server fails."""
+    names = ["model_50.pt", "model_400.pt", "model_x.pt", "config.yaml"]
+    files = {name: FakeWandbFile(name) for name in names}
+    run = types.SimpleNamespace(files=lambda: list(files.values()), file=files.__getitem__)
+    api = types.SimpleNamespace(run={"me/project/abc": run}.__getitem__)
+    monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(Api=lambda: api))
+    return files
+
+
+def test_the_highest_wandb_checkpoint_is_downloaded_once(tmp_path, wandb_files):
+    path, was_cached = get_wandb_checkpoint_path(tmp_path, Path("me/project/abc"))
+    assert (path, was_cached) == (tmp_path / "wandb_checkpoints" / "abc" / "model_400.pt", False)
+    assert path.read_text() == "model_400.pt"
+    assert get_wandb_checkpoint_path(tmp_path, Path("me/project/abc")) == (path, True)
+    # Asked for by name, a cached file needs no server.
+    wandb_files.clear()
+    assert get_wandb_checkpoint_path(tmp_path, Path("me/project/abc"), path.name) == (path, True)
+
+
+def test_a_named_wandb_checkpoint_must_exist(tmp_path, wandb_files):
+    path, _ = get_wandb_checkpoint_path(tmp_path, Path("me/project/abc"), "model_50.pt")
+    assert path.name == "model_50.pt"
+    with pytest.raises(ValueError, match=r"'model_7.pt'.*\['model_50.pt', 'model_400.pt'\]"):
+        get_wandb_checkpoint_path(tmp_path, Path("me/project/abc"), "model_7.pt")
+
+
+def test_a_broken_download_is_not_cached(tmp_path, wandb_files):
+    wandb_files["model_400.pt"].fails = True
+    with pytest.raises(ConnectionError):
+        get_wandb_checkpoint_path(tmp_path, Path("me/project/abc"))
+    assert list((tmp_path / "wandb_checkpoints" / "abc").iterdir()) == []

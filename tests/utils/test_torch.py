@@ -1,0 +1,35 @@
+"""Settings of torch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from mjlab.utils.torch import configure_torch_backends
+
+backends: Any = torch.backends
+
+
+@pytest.fixture(autouse=True)
+def _settings():
+    before = (backends.cudnn.deterministic, backends.cudnn.benchmark)
+    precision = backends.cuda.matmul.fp32_precision
+    yield
+    backends.cudnn.deterministic, backends.cudnn.benchmark = before
+    backends.cuda.matmul.fp32_precision = precision
+
+
+@pytest.mark.parametrize(("allow", "precision"), [(True, "tf32"), (False, "ieee")])
+def test_precision_is_set_everywhere(allow, precision):
+    configure_torch_backends(allow_tf32=allow)
+    for place in (backends.cuda.matmul, backends.cudnn.conv, backends.cudnn.rnn):
+        assert place.fp32_precision == precision
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_benchmarking_is_the_opposite_of_determinism(deterministic):
+    configure_torch_backends(deterministic=deterministic)
+    assert backends.cudnn.deterministic is deterministic
+    assert backends.cudnn.benchmark is not deterministic

@@ -1,0 +1,44 @@
+"""Tags of Weights & Biases runs."""
+
+from __future__ import annotations
+
+import os
+import sys
+import types
+
+import pytest
+
+from mjlab.utils.wandb import add_wandb_tags
+
+
+@pytest.fixture(autouse=True)
+def wandb(monkeypatch):
+    """A stand-in for the wandb module, without a live run."""
+    module = types.SimpleNamespace(run=None)
+    monkeypatch.setitem(sys.modules, "wandb", module)
+    # Set first, so that what the tests write is undone.
+    monkeypatch.setenv("WANDB_TAGS", "")
+    return module
+
+
+def test_tags_wait_for_the_next_run():
+    add_wandb_tags(["a", "b"])
+    add_wandb_tags(["b", "c"])
+    assert os.environ["WANDB_TAGS"] == "a,b,c"
+
+
+def test_a_live_run_gets_the_tags(wandb):
+    wandb.run = types.SimpleNamespace(tags=("a",))
+    add_wandb_tags(["b", "a"])
+    assert wandb.run.tags == ("a", "b")
+    assert os.environ["WANDB_TAGS"] == ""
+
+
+def test_a_run_may_have_no_tags_and_wandb_need_not_be_imported(wandb, monkeypatch):
+    wandb.run = types.SimpleNamespace(tags=None)
+    add_wandb_tags(["b"])
+    assert wandb.run.tags == ("b",)
+    monkeypatch.delitem(sys.modules, "wandb")
+    add_wandb_tags(["c"])
+    assert os.environ["WANDB_TAGS"] == "c"
+    assert "wandb" not in sys.modules
