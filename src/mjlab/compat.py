@@ -13,13 +13,16 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
+import inspect
+import time
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 C = TypeVar("C", bound=type)
 
-# Where an older name lives today, as "module:name"; "this module" is the key's own module.
+# Where an older name lives today, as "module:name".
 _EVENTS = {
     "EntityIndexing": "mjlab.entity:EntityIndexing",
     "FieldSpec": "mjlab.envs.mdp.dr.older:FieldSpec",
@@ -31,10 +34,6 @@ _EVENTS = {
     "sample_gaussian": "mjlab.utils.lab_api.math:sample_gaussian",
     "sample_log_uniform": "mjlab.utils.lab_api.math:sample_log_uniform",
     "sync_actuator_delays": "mjlab.envs.mdp.dr.older:sync_actuator_delays",
-}
-_REWARD_WEIGHT = {
-    "RewardWeightStage": "mjlab.envs.mdp.older_curriculums:RewardWeightStage",
-    "reward_weight": "mjlab.envs.mdp.older_curriculums:reward_weight",
 }
 _XML_ACTUATORS = {
     f"Xml{kind}Actuator{suffix}": f"mjlab.actuator.xml_actuator:XmlActuator{suffix}"
@@ -48,33 +47,38 @@ _TERRAIN_IMPORTER = {
     "TerrainImporter": "mjlab.terrains.terrain_entity:TerrainEntity",
     "TerrainImporterCfg": "mjlab.terrains.terrain_entity:TerrainEntityCfg",
 }
-_GET_ASSETS = {"get_assets": "mjlab.asset_zoo.older:get_assets"}
+_VISER = {
+    name: f"mjviser.conversions:{name}"
+    for name in (
+        "create_primitive_mesh",
+        "create_site_mesh",
+        "get_body_name",
+        "get_geom_texture_id",
+        "get_site_name",
+        "group_geoms_by_visual_compat",
+        "is_fixed_body",
+        "merge_geoms",
+        "merge_sites",
+        "mujoco_mesh_to_trimesh",
+        "rotation_matrix_from_vectors",
+    )
+}
+_VISER["rotation_quat_from_vectors"] = "mjlab.compat:rotation_quat_from_vectors"
 
 _NAMES: dict[str, dict[str, str]] = {
     "mjlab.actuator": {**_XML_ACTUATORS, **_DELAYED_ACTUATORS},
     "mjlab.actuator.xml_actuator": _XML_ACTUATORS,
-    "mjlab.asset_zoo.robots.i2rt_yam.yam_constants": _GET_ASSETS,
-    "mjlab.asset_zoo.robots.unitree_g1.g1_constants": _GET_ASSETS,
-    "mjlab.asset_zoo.robots.unitree_go1.go1_constants": _GET_ASSETS,
+    "mjlab.actuator.delayed_actuator": _DELAYED_ACTUATORS,
     "mjlab.envs.mdp": _EVENTS,
     "mjlab.envs.mdp.events": _EVENTS,
     "mjlab.envs.mdp.dr": {"sync_actuator_delays": _EVENTS["sync_actuator_delays"]},
     "mjlab.envs.mdp.dr.actuator": {"sync_actuator_delays": _EVENTS["sync_actuator_delays"]},
-    "mjlab.tasks.manipulation.mdp": {**_EVENTS, **_REWARD_WEIGHT},
-    "mjlab.tasks.manipulation.mdp.curriculums": _REWARD_WEIGHT,
-    "mjlab.tasks.tracking.mdp": _EVENTS,
-    "mjlab.tasks.velocity.mdp": {
-        **_EVENTS,
-        **_REWARD_WEIGHT,
-        "flat_orientation": "mjlab.tasks.velocity.mdp.older:flat_orientation",
-    },
-    "mjlab.tasks.velocity.mdp.curriculums": _REWARD_WEIGHT,
-    "mjlab.tasks.velocity.mdp.rewards": {
-        "flat_orientation": "mjlab.tasks.velocity.mdp.older:flat_orientation"
-    },
     "mjlab.terrains": _TERRAIN_IMPORTER,
-    "mjlab.utils.os": {"update_assets": "mjlab.asset_zoo.older:update_assets"},
-    "mjlab.utils.spec": {"disable_collision": "mjlab.utils.older_spec:disable_collision"},
+    "mjlab.terrains.terrain_importer": _TERRAIN_IMPORTER,
+    "mjlab.utils.os": {"update_assets": "mjlab.compat:update_assets"},
+    "mjlab.utils.spec": {"disable_collision": "mjlab.compat:disable_collision"},
+    "mjlab.viewer.base": {"Timer": "mjlab.compat:Timer"},
+    "mjlab.viewer.viser": _VISER,
 }
 
 # Fields that a class once had, with what becomes of a value given for them. A translation gets
@@ -104,7 +108,6 @@ _DROPPED_FIELDS: dict[str, dict[str, tuple[str, _Translation | None]]] = {
         ),
         "stochastic": ("distribution_cfg (None for a deterministic model)", None),
     },
-    "DifferentialIKActionCfg": {"scale": ("delta_pos_scale and delta_ori_scale", None)},
     "MujocoCfg": {
         "multiccd": (
             "enableflags=('multiccd',)",
@@ -131,10 +134,32 @@ def older_names(module_name: str) -> Callable[[str], Any]:
             raise AttributeError(f"module {module_name!r} has no attribute {name!r}")
         home, _, today = table[name].partition(":")
         value = getattr(importlib.import_module(home), today)
-        _warn_once(f"{module_name}.{name} is an older name; today it is {home}.{today}.")
+        message = f"{module_name}.{name} is an older name; today it is {home}.{today}."
+        if inspect.isfunction(value):
+            return _warning_when_called(value, message)
+        _warn_once(message)
         return value
 
     return __getattr__
+
+
+def older_exports(module_name: str) -> list[str]:
+    """Return the older names of a module that `from <module> import *` has to bring along.
+
+    Task packages build their own `mdp` module that way, so these belong in `__all__`. Only
+    functions: they warn when they are called, so that the import itself stays quiet.
+    """
+    return [name for name in _NAMES[module_name] if name[0].islower()]
+
+
+def _warning_when_called(function: Callable[..., Any], message: str) -> Callable[..., Any]:
+    # `wraps` also carries over what the function declares: the model fields it randomizes.
+    @functools.wraps(function)
+    def older(*args: Any, **kwargs: Any) -> Any:
+        _warn_once(message)
+        return function(*args, **kwargs)
+
+    return older
 
 
 def accepts_older_fields(cls: C) -> C:
@@ -160,3 +185,59 @@ def accepts_older_fields(cls: C) -> C:
 
     cls.__init__ = __init__
     return cls
+
+
+# Small things that have no successor, as they were.
+
+
+def disable_collision(geom: Any) -> None:
+    """Switch off the contacts of a geom of a spec."""
+    geom.contype = 0
+    geom.conaffinity = 0
+
+
+def update_assets(
+    assets: dict[str, Any],
+    path: str | Path,
+    meshdir: str | None = None,
+    glob: str = "*",
+    recursive: bool = False,
+) -> None:
+    """Add the contents of the files in a folder to `assets`, by `<meshdir>/<file name>`."""
+    folder = Path(path)
+    for file in folder.rglob(glob) if recursive else folder.glob(glob):
+        if file.is_file():
+            assets[f"{meshdir}/{file.name}" if meshdir else file.name] = file.read_bytes()
+
+
+def set_array_field(field: Any, values: Any) -> None:
+    """Write `values` into the first elements of an array field of a spec; None leaves it."""
+    for index, value in enumerate(values or ()):
+        field[index] = value
+
+
+def rotation_quat_from_vectors(from_vec: Any, to_vec: Any) -> Any:
+    """Return the quaternion (w, x, y, z) of the shortest rotation between two vectors."""
+    import numpy as np
+
+    start = np.asarray(from_vec, dtype=float) / np.linalg.norm(from_vec)
+    end = np.asarray(to_vec, dtype=float) / np.linalg.norm(to_vec)
+    quat = np.array([1.0 + start @ end, *np.cross(start, end)])
+    if quat[0] < 1e-9:
+        # Opposite vectors: half a turn about any axis across them.
+        axis = np.cross(start, np.eye(3)[np.argmin(np.abs(start))])
+        quat = np.array([0.0, *axis])
+    return quat / np.linalg.norm(quat)
+
+
+class Timer:
+    """Measures wall time between ticks, in seconds."""
+
+    def __init__(self) -> None:
+        self._previous = time.time()
+
+    def tick(self) -> float:
+        """Return the time since the last tick."""
+        now = time.time()
+        elapsed, self._previous = now - self._previous, now
+        return elapsed

@@ -77,6 +77,26 @@ def test_a_derived_field_is_current_when_first_read():
     assert torch.allclose(sim.data.site_xpos[:, tip, 2], torch.tensor(2.3))
 
 
+def test_reading_a_field_late_changes_nothing_else():
+    plain, late = make_sim(), make_sim()
+    for sim in (plain, late):
+        sim.data.qvel[:, 1] = 0.5
+        positions = sim.data.xpos
+        sim.step(90)
+        before = positions.clone()
+        if sim is late:
+            assert sim.data.cvel.abs().sum() > 0
+            assert torch.equal(positions, before)
+        sim.step(30)
+    assert torch.equal(plain.data.qpos, late.data.qpos)
+    assert torch.equal(plain.data.qvel, late.data.qvel)
+
+
+def test_a_field_that_no_sensor_feeds_is_refused():
+    with pytest.raises(AttributeError, match=r"subtree_linvel.*subtreelinvel"):
+        _ = make_sim().data.subtree_linvel
+
+
 def test_rotation_matrices_are_three_by_three():
     sim = make_sim()
     assert sim.data.xmat.shape == (4, sim.mj_model.nbody, 3, 3)
@@ -137,6 +157,15 @@ def test_reset_forgets_controls_that_were_not_stepped():
     sim.reset()
     sim.step(5)
     assert torch.equal(sim.data.qpos[:, 0], torch.zeros(4))
+
+
+def test_reset_clears_accelerations_of_a_diverged_environment():
+    sim = make_sim()
+    acceleration = sim.data.qacc
+    sim.data.qvel[1, 0] = float("nan")
+    sim.step()
+    sim.reset(torch.tensor([1]))
+    assert torch.isfinite(acceleration).all()
 
 
 def test_reset_leaves_derived_fields_until_forward():

@@ -78,7 +78,12 @@ class Simulation:
         self._expanded: set[str] = set()
         self._forward_callbacks: list[Callable[[], None]] = []
         self._sensor_context: Any = None
-        self.nan_guard = NanGuard(cfg.nan_guard, num_envs, self._mj_model)
+        self.nan_guard = NanGuard(
+            cfg.nan_guard,
+            num_envs,
+            self._mj_model,
+            model_fields=lambda: {name: getattr(self._model, name) for name in self._expanded},
+        )
         logger.info("Physics: %s, %d environments.", self.capabilities.description, num_envs)
 
     # What there is.

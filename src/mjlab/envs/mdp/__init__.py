@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from mjlab.compat import older_names
+from mjlab.compat import older_exports, older_names
 from mjlab.entity import Entity
 from mjlab.envs.mdp import dr
 from mjlab.envs.mdp.actions import (
@@ -163,6 +163,7 @@ __all__ = [
     "sample_uniform",
     "termination_curriculum",
     "time_out",
+    *older_exports(__name__),
 ]
 
 _older_name = older_names(__name__)

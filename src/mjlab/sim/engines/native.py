@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from mjlab.sim.engine import ROTATION_MATRICES, Capabilities, Engine, EngineUnavailableError
+from mjlab.sim.engines.sensor_fed import refuse_without_sensor
 
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
@@ -34,8 +35,14 @@ _ZERO_ON_RESET = (
     "qfrc_applied",
     "xfrc_applied",
     "userdata",
+    "qacc",
+    "act_dot",
+    "sensordata",
 )
-_INPUT_FIELDS = frozenset((*_ZERO_ON_RESET, "qpos", "eq_active", "mocap_pos", "mocap_quat"))
+_OUTPUT_FIELDS = frozenset({"qacc", "act_dot", "sensordata"})
+_INPUT_FIELDS = (
+    frozenset((*_ZERO_ON_RESET, "qpos", "eq_active", "mocap_pos", "mocap_quat")) - _OUTPUT_FIELDS
+)
 
 # What mj_setConst writes. `Batch.set_const` would bind these as double; they are expanded as
 # float32 first, so that they can be read through the seam.
@@ -103,6 +110,10 @@ class NativeEngine(Engine):
         self._qpos0 = torch.from_numpy(self._model.qpos0.astype(np.float32))
         self._eq_active0 = torch.from_numpy(np.array(self._model.eq_active0, dtype=bool))
         self._mocap_body = torch.from_numpy(np.flatnonzero(self._model.body_mocapid >= 0))
+        self._warm_start = _state_slice(self._model, mujoco.mjtState.mjSTATE_WARMSTART)
+        # Delays of MuJoCo's own actuators and sensors keep a history, which starts out not zero.
+        self._history = _state_slice(self._model, mujoco.mjtState.mjSTATE_HISTORY)
+        self._history0 = self._batch.bind("state")[0, self._history].copy()
         threads = self._batch.num_threads
         self.capabilities = Capabilities(
             name="native",
@@ -119,11 +130,26 @@ class NativeEngine(Engine):
 
     def data_field(self, name: str) -> torch.Tensor:
         if name not in self._tensors:
+            refuse_without_sensor(self._model, name)
             tensor = self._bind(name)
-            # A derived field reads zero until the next call, so make the call.
             if name not in _INPUT_FIELDS and tensor.numel():
-                self._batch.forward()
+                self._fill(name)
         return self._tensors[name]
+
+    def _fill(self, new: str) -> None:
+        """Compute a field that was just bound, which reads zero until the next call.
+
+        Only this field is made current. The others stay as they were, and so does the solver's
+        warm start: whether a field is first read in the middle of a step changes nothing else.
+        """
+        rows = self._batch.bind("state")
+        warm_start = rows[:, self._warm_start].copy()
+        derived = [n for n in self._arrays if n not in _INPUT_FIELDS and n != new]
+        saved = {name: self._arrays[name].copy() for name in derived}
+        self._batch.forward()
+        rows[:, self._warm_start] = warm_start
+        for name, values in saved.items():
+            self._arrays[name][:] = values
 
     def _bind(self, name: str) -> torch.Tensor:
         array = _as_float32(self._batch.bind, name, "MjData")
@@ -187,6 +213,9 @@ class NativeEngine(Engine):
                 self._tensors[name][rows] = 0
         qpos0 = self._model_tensors.get("qpos0")
         self._tensors["qpos"][rows] = self._qpos0 if qpos0 is None else qpos0[rows]
+        if self._history0.size:
+            chosen = slice(None) if env_ids is None else env_ids.numpy()
+            self._batch.bind("state")[chosen, self._history] = self._history0
         if "eq_active" in self._tensors:
             self._tensors["eq_active"][rows] = self._eq_active0
         for name, source in (("mocap_pos", "body_pos"), ("mocap_quat", "body_quat")):
@@ -328,6 +357,13 @@ def _as_tensor(name: str, array: np.ndarray[Any, Any]) -> torch.Tensor:
     """View rotation matrices as (N, ..., 3, 3), and every other field as it is."""
     tensor = torch.from_numpy(array)
     return tensor.view(*array.shape[:-1], 3, 3) if name in ROTATION_MATRICES else tensor
+
+
+def _state_slice(model: mujoco.MjModel, component: mujoco.mjtState) -> slice:
+    """Return where a component stands in an integration state, whose order is that of the bits."""
+    before = int(mujoco.mjtState.mjSTATE_INTEGRATION) & (int(component) - 1)
+    start = mujoco.mj_stateSize(model, before)
+    return slice(start, start + mujoco.mj_stateSize(model, int(component)))
 
 
 def _as_ids(env_ids: torch.Tensor | None) -> np.ndarray[Any, Any] | None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import mujoco
 
-from mjlab.compat import accepts_older_fields
+from mjlab.compat import accepts_older_fields, set_array_field
 from mjlab.utils.spec_editors.base import SpecCfg, check_values
 from mjlab.utils.string import filter_exp, resolve_field
 
@@ -98,6 +98,7 @@ class CollisionCfg(SpecCfg):
     """Weight, 0 to 1, for averaging the contact parameters of two geoms."""
     disable_other_geoms: bool = True
     """Switch off collisions of every geom that no pattern matches."""
+    set_array_field = staticmethod(set_array_field)
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
         """Write the setup. Raises `ValueError` if a value is not valid or missing for a geom."""

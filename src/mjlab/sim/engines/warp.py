@@ -1,0 +1,583 @@
+"""MuJoCo Warp: all environments in one batch of GPU kernels (or, for testing, on the CPU).
+
+Fields are Warp arrays seen through torch without a copy. The substep sequence and the forward pass
+are captured as graphs and replayed, on the CPU as well as on CUDA; nothing in a step waits for the
+GPU.
+
+The first use on a machine compiles the kernels (minutes); afterwards they come from Warp's cache.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import mujoco_warp
+import numpy as np
+import torch
+import warp
+
+from mjlab.sim.engine import (
+    ROTATION_MATRICES,
+    Capabilities,
+    Engine,
+    EngineUnavailableError,
+)
+from mjlab.sim.engines.sensor_fed import refuse_without_sensor
+from mjlab.sim.engines.warp_fields import find_data_field, find_model_field
+from mjlab.sim.engines.warp_support import (
+    OverflowWatch,
+    UnsupportedByWarpError,
+    mocap_bodies,
+    refuse_unsupported,
+    rotation_matrices,
+    static_geoms,
+)
+
+if TYPE_CHECKING:
+    from mjlab.sim.config import SimulationCfg
+
+# A type checker cannot follow how these two packages annotate their arrays.
+mjwarp: Any = mujoco_warp
+wp: Any = warp
+
+# What the next step depends on. `reset` sets all of it, and a saved state is made of it.
+_ZERO_ON_RESET = (
+    "time",
+    "qvel",
+    "act",
+    "qacc_warmstart",
+    "ctrl",
+    "qfrc_applied",
+    "xfrc_applied",
+    "userdata",
+)
+_STATE_FIELDS = (
+    *_ZERO_ON_RESET,
+    "qpos",
+    "eq_active",
+    "mocap_pos",
+    "mocap_quat",
+    "history",
+)
+# Results that MuJoCo's reset clears too. Poses and velocities keep their values until `forward`.
+_RESULTS_ZERO_ON_RESET = (
+    "qacc",
+    "act_dot",
+    "sensordata",
+    "energy",
+    "ne",
+    "nf",
+    "nl",
+    "nefc",
+)
+# A geom that is welded to the world moves only if one of these is changed.
+_STATIC_POSE = frozenset({"body_pos", "body_quat", "geom_pos", "geom_quat"})
+
+_RECOMPUTE = {1: mjwarp.set_const_fixed, 2: mjwarp.set_const_0, 3: mjwarp.set_const}
+_CONSTANTS_AT_QPOS0 = (
+    "dof_invweight0",
+    "body_invweight0",
+    "tendon_length0",
+    "tendon_invweight0",
+    "actuator_acc0",
+    "actuator_biasprm",
+    "eq_data",
+    "cam_pos0",
+    "cam_poscom0",
+    "cam_mat0",
+    "light_pos0",
+    "light_poscom0",
+    "light_dir0",
+)
+# Substeps in one captured graph at most; longer runs replay the graph of a single substep.
+_MAX_CAPTURED_STEPS = 16
+
+
+def _be_quiet() -> None:
+    """Keep Warp's banner and its compile messages from users who did not ask for them."""
+    if os.environ.get("MJLAB_WARP_QUIET", "1").strip().lower() in ("0", "false", "no"):
+        return
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+
+
+class WarpEngine(Engine):
+    """MuJoCo Warp on one CUDA device, or on the CPU."""
+
+    def __init__(
+        self, model: mujoco.MjModel, num_envs: int, cfg: SimulationCfg, device: str
+    ) -> None:
+        """Allocate `num_envs` environments, all in the forwarded state of `qpos0`.
+
+        Raises:
+            UnsupportedByWarpError: the model needs what MuJoCo Warp does not have.
+            EngineUnavailableError: there is no such device.
+        """
+        refuse_unsupported(model)
+        _be_quiet()
+        self.num_envs = num_envs
+        self.device = torch.device(device)
+        self._wp_device = _find_device(self.device)
+        self._host = mujoco.MjData(model)
+        mujoco.mj_forward(model, self._host)
+        self._sizes = (int(model.nv), int(model.nhistory))
+        self._velocity_constraints = bool(
+            np.isin(model.eq_type, (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)).any()
+        )
+        # MuJoCo leaves these at zero; Warp fills them up when it recomputes constants.
+        self._zero_invweight0 = torch.as_tensor(model.body_invweight0 == 0, device=device)
+        self._torch_streams: dict[int, Any] = {}
+        with self._ordered():
+            self._allocate(model, cfg)
+        cfg.apply_wp_opt(self.wp_model.opt)
+        self._data_tensors: dict[str, torch.Tensor] = {}
+        self._model_tensors: dict[str, torch.Tensor] = {}
+        self._graphs: dict[str, Any] = {}
+        self._eq_active0 = torch.as_tensor(model.eq_active0.astype(bool), device=self.device)
+        self._mocap_bodies = torch.as_tensor(
+            mocap_bodies(model), dtype=torch.int64, device=self.device
+        )
+        geoms = torch.as_tensor(static_geoms(model), dtype=torch.int64)
+        self._static_geoms = geoms.to(self.device)
+        self._static_bodies = torch.as_tensor(model.geom_bodyid)[geoms].to(self.device).long()
+        self._overflow = OverflowWatch(
+            as_torch(self.wp_data.overflow),
+            {kind.name: int(kind) for kind in mjwarp.OverflowType},
+            {
+                "nconmax": self.wp_data.naconmax // self.num_envs,
+                "njmax": self.wp_data.njmax,
+            },
+        )
+        self.capabilities = Capabilities(
+            name="warp",
+            device=str(device),
+            description=(
+                f"warp (mujoco_warp {mjwarp.__version__}, Warp {wp.config.version}), "
+                f"device {device}" + ("" if self._on_cuda else ", for testing: slow")
+            ),
+        )
+        self.create_graph()
+
+    def _allocate(self, model: mujoco.MjModel, cfg: SimulationCfg) -> None:
+        limits = {"nconmax": cfg.nconmax, "njmax": cfg.njmax}
+        try:
+            self.wp_model = mjwarp.put_model(model)
+            self.wp_data = mjwarp.put_data(model, self._host, self.num_envs, **limits)
+        except NotImplementedError as error:
+            raise UnsupportedByWarpError(
+                f"The warp engine cannot simulate this model: {error} "
+                "Change it, or use --engine native (SimulationCfg.engine='native')."
+            ) from error
+        except ValueError as error:
+            raise ValueError(
+                f"MuJoCo Warp refuses nconmax={cfg.nconmax}, njmax={cfg.njmax} or the model: "
+                f"{error}. Change SimulationCfg.nconmax or njmax; None estimates them."
+            ) from error
+        # Kernels would print to the standard output at every overflow. The flags that they set
+        # besides are read now and then, and each kind of overflow is logged once.
+        self.wp_model.opt.warn_overflow = 0
+        if self._on_cuda:
+            self.wp_model.opt.graph_conditional = wp.is_conditional_graph_supported()
+
+    # Order of work on the GPU.
+
+    @property
+    def _on_cuda(self) -> bool:
+        return self._wp_device.is_cuda
+
+    @contextmanager
+    def _ordered(self) -> Generator[None]:
+        """Run Warp's work after what torch has queued and before what torch will queue.
+
+        Warp works on its own stream, because memory that it frees is freed in that stream's
+        order and because a capture is not allowed on torch's default stream. The two streams
+        wait for each other on the device; the host waits for neither.
+        """
+        with wp.ScopedDevice(self._wp_device):
+            if not self._on_cuda:
+                yield
+                return
+            torch_stream = self._torch_stream()
+            self._wp_device.stream.wait_stream(torch_stream)
+            yield
+            torch_stream.wait_stream(self._wp_device.stream)
+
+    def _torch_stream(self) -> Any:
+        """Return torch's current stream as Warp sees it; made once for each."""
+        stream = torch.cuda.current_stream(self.device)
+        if stream.cuda_stream not in self._torch_streams:
+            self._torch_streams[stream.cuda_stream] = wp.stream_from_torch(stream)
+        return self._torch_streams[stream.cuda_stream]
+
+    def _launch(self, name: str, work: Callable[[], None]) -> None:
+        """Run `work` by replaying its graph, captured on first use."""
+        with self._ordered():
+            if name not in self._graphs:
+                with wp.ScopedCapture(device=self._wp_device) as capture:
+                    work()
+                self._graphs[name] = capture.graph
+            wp.capture_launch(self._graphs[name])
+
+    def create_graph(self) -> None:
+        """Drop captured graphs; they are captured anew when next needed.
+
+        On CUDA, kernels are loaded first by one step that is undone, because older drivers cannot
+        load them during a capture.
+        """
+        self._graphs.clear()
+        if not self._on_cuda:
+            return
+        before = {name: self.data_field(name).clone() for name in _STATE_FIELDS}
+        with self._ordered():
+            mjwarp.step(self.wp_model, self.wp_data)
+        for name, value in before.items():
+            self.data_field(name).copy_(value)
+
+    # Fields.
+
+    def data_field(self, name: str) -> torch.Tensor:
+        if name not in self._data_tensors:
+            array = find_data_field(self.wp_data, name)
+            refuse_without_sensor(self._host.model, name)
+            shape = getattr(getattr(self._host, name), "shape", ())
+            if name in ROTATION_MATRICES:
+                shape = (*shape[:-1], 3, 3)
+            self._data_tensors[name] = as_torch(array).view(self.num_envs, *shape)
+        return self._data_tensors[name]
+
+    def model_field(self, name: str) -> torch.Tensor:
+        if name not in self._model_tensors:
+            raise ValueError(f"MjModel field {name!r} has not been expanded.")
+        return self._model_tensors[name]
+
+    def is_expanded(self, field: str) -> bool:
+        return field in self._model_tensors
+
+    def expand(self, fields: tuple[str, ...]) -> None:
+        new = [name for name in dict.fromkeys(fields) if name not in self._model_tensors]
+        with self._ordered():
+            expand_arrays(self.wp_model, self.num_envs, new)
+        for name in new:
+            struct, attribute = find_model_field(self.wp_model, name)
+            self._model_tensors[name] = _like_mujoco(name, getattr(struct, attribute))
+        # A graph keeps the addresses of the arrays it was captured with.
+        if new and self.num_envs > 1:
+            self._graphs.clear()
+
+    def constants_written_by(self, level: int) -> tuple[str, ...]:
+        names: tuple[str, ...] = ()
+        if level in (1, 3):
+            names += ("body_subtreemass",)
+        if level in (2, 3):
+            names += _CONSTANTS_AT_QPOS0
+        return tuple(name for name in names if getattr(self.wp_model, name).size)
+
+    def recompute_constants(self, level: int, env_ids: torch.Tensor | None) -> None:
+        if level not in _RECOMPUTE:
+            raise ValueError(f"Unknown recompute level {level}; it is one of 1, 2 and 3.")
+        written = self.constants_written_by(level)
+        self.expand(written)
+        # The solver's scale is no field of MjModel, but it too differs between environments.
+        self.expand(("stat.meaninertia",))
+        tensors = [self._model_tensors[name] for name in written]
+        with self._only_rows(env_ids, tensors):
+            with self._ordered():
+                _RECOMPUTE[level](self.wp_model, self.wp_data)
+            if "body_invweight0" in written:
+                self._restore_zero_invweights()
+
+    def _restore_zero_invweights(self) -> None:
+        """Undo a substitution that MuJoCo does not make.
+
+        A body that only slides has no rotational inverse weight, and one that turns about its
+        centre of mass no translational one. Warp puts the other one in its place.
+        """
+        weights = as_torch(self.wp_model.body_invweight0)
+        substituted = (weights[..., :1] == weights[..., 1:]) & self._zero_invweight0
+        weights.masked_fill_(substituted, 0.0)
+
+    @contextmanager
+    def _only_rows(
+        self, env_ids: torch.Tensor | None, tensors: list[torch.Tensor]
+    ) -> Generator[None]:
+        """Undo what happens within to the rows of other environments."""
+        if env_ids is None:
+            yield
+            return
+        before = [tensor.clone() for tensor in tensors]
+        yield
+        chosen = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        chosen.index_fill_(0, env_ids, True)
+        for tensor, old in zip(tensors, before, strict=True):
+            mask = chosen.view(-1, *[1] * (tensor.dim() - 1))
+            tensor.copy_(torch.where(mask, tensor, old))
+
+    # Physics.
+
+    def step(self, nstep: int) -> None:
+        if nstep <= _MAX_CAPTURED_STEPS:
+            self._launch(f"step{nstep}", lambda: self._substeps(nstep))
+        else:
+            for _ in range(nstep):
+                self._launch("step1", lambda: self._substeps(1))
+        self._overflow.tick()
+
+    def _substeps(self, nstep: int) -> None:
+        for _ in range(nstep):
+            self._refresh_velocities()
+            mjwarp.step(self.wp_model, self.wp_data)
+
+    def _refresh_velocities(self) -> None:
+        """Make `cvel` current where constraints read it before MuJoCo Warp computes it.
+
+        Connect and weld constraints use body velocities, which Warp computes after them. They
+        would use those of the previous substep, and after a reset those of the previous episode,
+        NaN included.
+        """
+        if self._velocity_constraints:
+            mjwarp.fwd_kinematics(self.wp_model, self.wp_data)
+            mjwarp.com_vel(self.wp_model, self.wp_data)
+
+    def forward(self, env_ids: torch.Tensor | None) -> None:
+        # Warp computes all environments; those not asked for get their values back, so that
+        # derived fields of theirs that are one substep old stay so, as on the native engine.
+        results = [
+            tensor for name, tensor in self._data_tensors.items() if name not in _STATE_FIELDS
+        ]
+        with self._only_rows(env_ids, results):
+            if len(self._static_geoms) and not _STATIC_POSE.isdisjoint(self._model_tensors):
+                self._place_static_geoms()
+            self._launch("forward", self._forward)
+
+    def _forward(self) -> None:
+        self._refresh_velocities()
+        mjwarp.forward(self.wp_model, self.wp_data)
+
+    def _place_static_geoms(self) -> None:
+        """Compute the poses of geoms that are welded to the world, which Warp does only once."""
+        self._launch("kinematics", lambda: mjwarp.kinematics(self.wp_model, self.wp_data))
+        geoms, bodies = self._static_geoms, self._static_bodies
+        positions = as_torch(self.wp_model.geom_pos)[:, geoms, :, None]
+        rotations = rotation_matrices(as_torch(self.wp_model.geom_quat)[:, geoms])
+        frames = self.data_field("xmat")[:, bodies]
+        origins = self.data_field("xpos")[:, bodies]
+        self.data_field("geom_xpos")[:, geoms] = origins + (frames @ positions).squeeze(-1)
+        self.data_field("geom_xmat")[:, geoms] = frames @ rotations
+
+    def reset(self, env_ids: torch.Tensor | None) -> None:
+        # `mjwarp.reset_data` clears the contacts of all environments together with those of the
+        # first, and only as many activations as there are controls; so each field is reset here.
+        for name in (*_ZERO_ON_RESET, *_RESULTS_ZERO_ON_RESET):
+            tensor = self.data_field(name)
+            tensor.zero_() if env_ids is None else tensor.index_fill_(0, env_ids, 0)
+        _set_rows(self.data_field("qpos"), env_ids, as_torch(self.wp_model.qpos0))
+        _set_rows(self.data_field("eq_active"), env_ids, self._eq_active0[None])
+        for name, source in (("mocap_pos", "body_pos"), ("mocap_quat", "body_quat")):
+            poses = as_torch(getattr(self.wp_model, source))
+            _set_rows(self.data_field(name), env_ids, poses[:, self._mocap_bodies])
+        if self._sizes[1]:
+            self._reset_history(env_ids)
+
+    def _reset_history(self, env_ids: torch.Tensor | None) -> None:
+        mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        if env_ids is not None:
+            mask.zero_().index_fill_(0, env_ids, True)
+        with self._ordered():
+            mjwarp.reset_history(self.wp_model, self.wp_data, reset=wp.from_torch(mask))
+
+    def check_overflow(self) -> None:
+        """Log now, once a kind, what exceeded its capacity so far. Waits for the GPU."""
+        self._overflow.check(wait=True)
+
+    # Queries.
+
+    def raycast(
+        self,
+        origins: torch.Tensor,
+        directions: torch.Tensor,
+        geom_groups: tuple[int, ...] | None,
+        exclude_body_ids: torch.Tensor | None,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        shape = tuple(origins.shape[:2])
+        distances = torch.empty(shape, device=self.device)
+        normals = torch.empty((*shape, 3), device=self.device)
+        geom_ids = torch.empty(shape, dtype=torch.int32, device=self.device)
+        if exclude_body_ids is None:
+            exclude_body_ids = torch.full(shape[1:], -1, dtype=torch.int32, device=self.device)
+        groups = [-1.0] * 6
+        if geom_groups is not None:
+            groups = [float(group in geom_groups) for group in range(6)]
+        with self._ordered():
+            mjwarp.rays(
+                self.wp_model,
+                self.wp_data,
+                wp.from_torch(origins.contiguous(), dtype=wp.vec3),
+                wp.from_torch(directions.contiguous(), dtype=wp.vec3),
+                wp.types.vector(length=6, dtype=float)(*groups),
+                True,
+                wp.from_torch(exclude_body_ids.to(torch.int32).contiguous()),
+                wp.from_torch(distances),
+                wp.from_torch(geom_ids),
+                wp.from_torch(normals, dtype=wp.vec3),
+            )
+        return distances, normals, geom_ids
+
+    def jacobian(
+        self, points: torch.Tensor, body_ids: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        shape = (self.num_envs, 3, self._sizes[0])
+        translational = torch.empty(shape, device=self.device)
+        rotational = torch.empty(shape, device=self.device)
+        with self._ordered():
+            mjwarp.jac(
+                self.wp_model,
+                self.wp_data,
+                wp.from_torch(translational),
+                wp.from_torch(rotational),
+                wp.from_torch(points.contiguous(), dtype=wp.vec3),
+                wp.from_torch(body_ids.to(torch.int32).contiguous()),
+            )
+        return translational, rotational
+
+    # Copies.
+
+    def copy_to_host(self, env_idx: int, mj_data: mujoco.MjData) -> None:
+        for name in _STATE_FIELDS:
+            value = self.data_field(name)[env_idx].cpu().numpy()
+            if name == "time":
+                mj_data.time = float(value)
+            else:
+                getattr(mj_data, name)[:] = value
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "data": {name: self.data_field(name).cpu().clone() for name in _STATE_FIELDS},
+            "model": {
+                name: tensor.cpu().clone()
+                for name, tensor in self._model_tensors.items()
+                if not name.startswith("stat.")
+            },
+            "stat": {
+                name: tensor.cpu().clone()
+                for name, tensor in self._model_tensors.items()
+                if name.startswith("stat.")
+            },
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        for name, value in state["data"].items():
+            if value.shape != self.data_field(name).shape:
+                raise ValueError(
+                    f"The saved simulation holds {name} as {tuple(value.shape)}, but here it is "
+                    f"{tuple(self.data_field(name).shape)}. Resume with the same model and --num-envs."
+                )
+        fields = {**state["model"], **state["stat"]}
+        self.expand(tuple(fields))
+        for name, value in fields.items():
+            self._model_tensors[name].copy_(value)
+        for name, value in state["data"].items():
+            self.data_field(name).copy_(value)
+        self.forward(None)
+
+
+# Warp's structs.
+
+
+def as_torch(array: Any) -> torch.Tensor:
+    """View a Warp array as a torch tensor that shares its memory; vectors become last dimensions."""
+    if array.size == 0:
+        inner = getattr(array.dtype, "_shape_", ())
+        scalar = wp.dtype_to_torch(getattr(array.dtype, "_wp_scalar_type_", array.dtype))
+        device = wp.device_to_torch(array.device)
+        return torch.empty((*array.shape, *inner), dtype=scalar, device=device)
+    return wp.to_torch(array)
+
+
+def expand_arrays(model: Any, nworld: int, names: list[str]) -> None:
+    """Give each of `nworld` worlds its own row of fields of a `mujoco_warp.Model`, in place.
+
+    Raises:
+        ValueError: a field that does not exist or that MuJoCo Warp cannot hold per world.
+    """
+    found = [find_model_field(model, name) for name in names]
+    for struct, attribute in found:
+        shared = getattr(struct, attribute)
+        if nworld == 1 or shared.shape[0] == nworld:
+            continue
+        own = wp.empty((nworld, *shared.shape[1:]), dtype=shared.dtype, device=shared.device)
+        if own.size:
+            with _torch_on_warps_stream(shared.device):
+                as_torch(own).copy_(as_torch(shared).expand(nworld, *as_torch(shared).shape[1:]))
+        own._is_batched = True
+        setattr(struct, attribute, own)
+
+
+@contextmanager
+def _torch_on_warps_stream(device: Any) -> Generator[None]:
+    if not device.is_cuda:
+        yield
+        return
+    with torch.cuda.stream(wp.stream_to_torch(device)):
+        yield
+
+
+def set_broadphase(wp_opt: Any, kind: str | None, filters: tuple[str, ...] | None) -> None:
+    """Write `SimulationCfg.broadphase` and `broadphase_filter` onto `mujoco_warp`'s options.
+
+    Raises:
+        ValueError: an unknown name, with the known ones.
+    """
+    if kind is not None:
+        wp_opt.broadphase = _member(mjwarp.BroadphaseType, kind, "broadphase")
+    if filters is not None:
+        bits = mjwarp.BroadphaseFilter(0)
+        for name in filters:
+            bits |= _member(mjwarp.BroadphaseFilter, name, "broadphase_filter")
+        wp_opt.broadphase_filter = bits
+
+
+def _member(enum: Any, name: str, option: str) -> Any:
+    if name.upper() not in enum.__members__:
+        known = ", ".join(member.lower() for member in enum.__members__)
+        raise ValueError(f"SimulationCfg.{option} is {name!r}; choose from: {known}.")
+    return enum[name.upper()]
+
+
+def _like_mujoco(name: str, array: Any) -> torch.Tensor:
+    """View an expanded model field in MuJoCo's shape."""
+    tensor = as_torch(array)
+    return tensor.flatten(-2) if name == "geom_aabb" else tensor
+
+
+def _set_rows(tensor: torch.Tensor, env_ids: torch.Tensor | None, values: torch.Tensor) -> None:
+    """Write `values`, of one row or of one a row of `tensor`, into the rows `env_ids`."""
+    rows = values.expand(tensor.shape)
+    if env_ids is None:
+        tensor.copy_(rows)
+    else:
+        tensor.index_copy_(0, env_ids, rows.index_select(0, env_ids))
+
+
+def _find_device(device: torch.device) -> Any:
+    if device.type not in ("cpu", "cuda"):
+        raise EngineUnavailableError(
+            f"The warp engine runs on cuda or cpu devices, not on {str(device)!r}."
+        )
+    wp.init()
+    if device.type == "cpu":
+        return wp.get_device("cpu")
+    if not wp.is_cuda_available() or not torch.cuda.is_available():
+        raise EngineUnavailableError(
+            f"Device {str(device)!r} needs an NVIDIA GPU, and none is usable here. "
+            "Use --device cpu (with --engine native, which is faster there)."
+        )
+    index = torch.cuda.current_device() if device.index is None else device.index
+    if index >= wp.get_cuda_device_count():
+        raise EngineUnavailableError(
+            f"There is no device cuda:{index}; this machine has cuda:0 to "
+            f"cuda:{wp.get_cuda_device_count() - 1}."
+        )
+    return wp.get_cuda_device(index)

@@ -1,0 +1,509 @@
+"""What is particular to the MuJoCo Warp engine. That it computes the same is in the parity tests."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+
+import mujoco
+import pytest
+import torch
+
+from mjlab.sim.config import MujocoCfg, SimulationCfg
+from mjlab.sim.engine import EngineUnavailableError
+from mjlab.sim.engines.warp import WarpEngine
+from mjlab.sim.engines.warp_support import rotation_matrices
+from mjlab.sim.randomization import expand_model_fields
+from mjlab.sim.sim_data import TorchArray, WarpBridge
+
+from .parity_models import CARTPOLE, HINGE_CHAIN, LANDING_BOX, MOCAP
+
+TWO_JOINTS = """
+<mujoco>
+  <worldbody>
+    <body><joint name="a"/><geom size=".1" mass="1"/>
+      <body pos=".3 0 0"><joint name="b"/><geom size=".1" mass="1"/></body></body>
+  </worldbody>
+  <actuator>
+    <general joint="a" dyntype="user" actdim="3"/>
+    <general joint="b" dyntype="integrator"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def make_engine(xml: str, num_envs: int = 2, **cfg: object) -> WarpEngine:
+    model = mujoco.MjModel.from_xml_string(xml)
+    return WarpEngine(model, num_envs, SimulationCfg(engine="warp", **cfg), "cpu")  # type: ignore[arg-type]
+
+
+def on_the_floor(engine: WarpEngine) -> WarpEngine:
+    engine.data_field("qpos")[:, 2] = 0.049
+    engine.forward(None)
+    return engine
+
+
+# What cannot be done is refused by name.
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ('<option solver="PGS"/>', "the solver 'pgs'"),
+        ('<option noslip_iterations="3"/>', "noslip_iterations=3"),
+        ('<option><flag autoreset="disable"/></option>', "the disable flag 'autoreset'"),
+        ('<option><flag midphase="disable"/></option>', "the disable flag 'midphase'"),
+        ('<option><flag sleep="enable"/></option>', "the enable flag 'sleep'"),
+        ('<option><flag fwdinv="enable"/></option>', "the enable flag 'fwdinv'"),
+    ],
+)
+def test_an_unsupported_option_is_refused_by_name(option: str, said: str) -> None:
+    xml = TWO_JOINTS.replace("<worldbody>", f"{option}<worldbody>", 1)
+    with pytest.raises(EngineUnavailableError, match="--engine native") as caught:
+        make_engine(xml)
+    assert said in str(caught.value)
+    # Code written for MuJoCo Warp itself expects this class.
+    assert isinstance(caught.value, NotImplementedError)
+
+
+def test_all_problems_are_named_at_once() -> None:
+    model = mujoco.MjModel.from_xml_string(TWO_JOINTS)
+    MujocoCfg(solver="pgs", disableflags=("midphase",)).apply(model)
+    with pytest.raises(EngineUnavailableError) as caught:
+        WarpEngine(model, 1, SimulationCfg(), "cpu")
+    assert "pgs" in str(caught.value)
+    assert "midphase" in str(caught.value)
+
+
+def test_what_only_mujoco_warp_notices_is_refused_the_same_way() -> None:
+    boxes = """
+    <mujoco><option><flag multiccd="enable"/></option><worldbody>
+      <geom type="box" size=".1 .1 .1" margin=".01"/>
+      <body pos="0 0 .3"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
+    </worldbody></mujoco>"""
+    with pytest.raises(EngineUnavailableError, match="margin.*--engine native"):
+        make_engine(boxes)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_refused() -> None:
+    model = mujoco.MjModel.from_xml_string(TWO_JOINTS)
+    with pytest.raises(EngineUnavailableError, match="--device cpu"):
+        WarpEngine(model, 1, SimulationCfg(), "cuda:0")
+
+
+def test_too_small_a_capacity_is_refused_at_construction() -> None:
+    xml = LANDING_BOX.replace('pos="0 0 .4"', 'pos="0 0 .04"')
+    with pytest.raises(ValueError, match=r"nconmax=1.*SimulationCfg\.nconmax"):
+        make_engine(xml, nconmax=1)
+
+
+@pytest.mark.parametrize("field", ["geom_contype", "hfield_data", "jnt_type"])
+def test_expanding_a_field_that_warp_shares_is_refused_by_name(field: str) -> None:
+    with pytest.raises(ValueError, match=f"shares model field '{field}'"):
+        make_engine(TWO_JOINTS).expand((field,))
+
+
+def test_an_unknown_model_field_names_close_ones() -> None:
+    with pytest.raises(ValueError, match="Close names: .*body_mass"):
+        make_engine(TWO_JOINTS).expand(("body_mas",))
+
+
+@pytest.mark.parametrize(
+    ("field", "said"),
+    [
+        ("contact", "contact sensor"),
+        ("efc_force", "contact sensor"),
+        ("qpso", "Close names: qpos"),
+        ("nworld", "no per-environment MjData field"),
+        ("cfrc_ext", "accelerometer, force"),
+        ("subtree_angmom", "subtreeangmom"),
+    ],
+)
+def test_a_data_field_that_is_not_offered_says_why(field: str, said: str) -> None:
+    with pytest.raises(AttributeError, match=said):
+        make_engine(TWO_JOINTS).data_field(field)
+
+
+def test_a_field_that_was_not_expanded_is_not_handed_out() -> None:
+    with pytest.raises(ValueError, match="has not been expanded"):
+        make_engine(TWO_JOINTS).model_field("body_mass")
+
+
+# Fields.
+
+
+def test_fields_are_the_arrays_themselves() -> None:
+    engine = make_engine(CARTPOLE)
+    engine.data_field("qpos")[1, 0] = 0.7
+    assert engine.wp_data.qpos.numpy()[1, 0] == pytest.approx(0.7)
+    assert engine.data_field("qpos") is engine.data_field("qpos")
+    engine.expand(("body_mass",))
+    engine.model_field("body_mass")[1] = 3.0
+    assert (engine.wp_model.body_mass.numpy()[1] == 3.0).all()
+    assert (engine.wp_model.body_mass.numpy()[0] != 3.0).any()
+
+
+def test_expanded_fields_have_mujocos_shape_and_values() -> None:
+    engine = make_engine(MOCAP, num_envs=3)
+    host = mujoco.MjModel.from_xml_string(MOCAP)
+    for field in ("geom_aabb", "eq_data", "cam_intrinsic", "body_quat", "geom_friction"):
+        engine.expand((field,))
+        value = torch.as_tensor(getattr(host, field), dtype=torch.float32)
+        torch.testing.assert_close(engine.model_field(field), value.expand(3, *value.shape))
+    engine.expand(("gravity", "opt.timestep"))
+    assert engine.model_field("gravity").shape == (3, 3)
+    assert engine.model_field("opt.timestep").tolist() == pytest.approx([0.002] * 3)
+
+
+def test_expanding_again_keeps_values_and_the_tensor() -> None:
+    engine = make_engine(CARTPOLE)
+    engine.expand(("body_mass",))
+    field = engine.model_field("body_mass")
+    field[0] = 5.0
+    engine.expand(("body_mass", "dof_damping"))
+    assert engine.model_field("body_mass") is field
+    assert (field[0] == 5.0).all()
+
+
+def test_a_step_uses_fields_expanded_after_earlier_steps() -> None:
+    # A captured graph would go on with the shared array.
+    engine = make_engine(LANDING_BOX)
+    engine.step(1)
+    engine.forward(None)
+    engine.expand(("gravity",))
+    engine.model_field("gravity")[1] = 0.0
+    engine.forward(None)
+    assert engine.data_field("qacc")[:, 2].tolist() == pytest.approx([-9.81, 0.0], abs=1e-5)
+    engine.data_field("qvel").zero_()
+    engine.step(1)
+    velocities = engine.data_field("qvel")[:, 2].tolist()
+    assert velocities == pytest.approx([-9.81 * 0.002, 0.0], abs=1e-6)
+
+
+def test_one_environment_can_be_written_after_expansion() -> None:
+    engine = make_engine(CARTPOLE, num_envs=1)
+    engine.expand(("body_mass",))
+    engine.model_field("body_mass")[0, -1] = 4.0
+    assert engine.wp_model.body_mass.numpy()[0, -1] == 4.0
+
+
+# Capacities and options.
+
+
+def test_options_reach_mujoco_warp() -> None:
+    engine = make_engine(
+        LANDING_BOX,
+        contact_sensor_maxmatch=7,
+        broadphase="sap_tile",
+        broadphase_filter=("plane", "aabb"),
+        nconmax=20,
+        njmax=40,
+    )
+    opt, data = engine.wp_model.opt, engine.wp_data
+    assert opt.contact_sensor_maxmatch == 7
+    assert opt.broadphase.name == "SAP_TILE"
+    assert opt.broadphase_filter.name == "PLANE|AABB"
+    assert (data.naconmax, data.njmax) == (40, 40)
+
+
+def test_capacities_are_estimated_if_not_given() -> None:
+    # The first of 16, 24, 32, 48, 64, ... not below 45 contacts and 53 constraint rows.
+    engine = make_engine(LANDING_BOX)
+    assert (engine.wp_data.naconmax, engine.wp_data.njmax) == (2 * 48, 64)
+
+
+def test_an_unknown_broadphase_lists_the_known_ones() -> None:
+    with pytest.raises(ValueError, match="nxn, sap_tile, sap_segmented"):
+        make_engine(TWO_JOINTS, broadphase="octree")
+
+
+def test_an_overflow_is_logged_once(
+    caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    engine = on_the_floor(make_engine(LANDING_BOX, njmax=4))
+    with caplog.at_level(logging.WARNING):
+        for _ in range(70):
+            engine.step(1)
+    assert "njmax=4" in caplog.text, "it was not noticed while stepping"
+    engine.check_overflow()
+    messages = [record.getMessage() for record in caplog.records]
+    assert len([text for text in messages if "njmax=4" in text]) == 1, messages
+    assert "overflow" not in capfd.readouterr().out
+
+
+def test_a_run_within_its_capacity_logs_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    engine = on_the_floor(make_engine(LANDING_BOX))
+    with caplog.at_level(logging.WARNING):
+        engine.step(2)
+        engine.check_overflow()
+    assert not caplog.records
+
+
+# State.
+
+
+def test_reset_clears_every_activation() -> None:
+    engine = make_engine(TWO_JOINTS)
+    act = engine.data_field("act")
+    assert act.shape == (2, 4), "more activations than actuators"
+    act.fill_(1.0)
+    engine.reset(torch.tensor([1]))
+    assert act[0].tolist() == [1.0] * 4
+    assert act[1].tolist() == [0.0] * 4
+
+
+def test_reset_restarts_the_delay_lines_of_its_environments() -> None:
+    xml = TWO_JOINTS.replace('dyntype="integrator"', 'delay=".01" nsample="4"')
+    xml = xml.replace('dyntype="user" actdim="3"', "")
+    engine = make_engine(xml)
+    history = engine.data_field("history")
+    start = history.clone()
+    engine.data_field("ctrl").fill_(1.0)
+    engine.step(2)
+    after = history.clone()
+    assert not torch.equal(after, start)
+    engine.reset(torch.tensor([1]))
+    torch.testing.assert_close(history[1], start[1])
+    assert torch.equal(history[0], after[0])
+
+
+def test_resetting_the_first_environment_keeps_the_contacts_of_others() -> None:
+    engine = on_the_floor(make_engine(LANDING_BOX))
+    sensordata = engine.data_field("sensordata")
+    contacts, found = engine.wp_data.nacon.numpy()[0], sensordata[1].clone()
+    assert contacts > 0
+    engine.reset(torch.tensor([0]))
+    assert engine.wp_data.nacon.numpy()[0] == contacts
+    assert torch.equal(sensordata[1], found)
+    assert not sensordata[0].any()
+
+
+def test_reset_restores_the_mocap_pose_and_equalities_of_the_model() -> None:
+    engine = make_engine(MOCAP)
+    start = engine.data_field("mocap_pos").clone(), engine.data_field("mocap_quat").clone()
+    engine.expand(("body_pos",))
+    engine.model_field("body_pos")[1, 1, 2] += 0.25
+    for field in ("mocap_pos", "mocap_quat"):
+        engine.data_field(field).add_(1.0)
+    engine.data_field("eq_active").fill_(False)
+    engine.reset(None)
+    assert engine.data_field("eq_active").all()
+    assert torch.equal(engine.data_field("mocap_quat"), start[1])
+    assert torch.equal(engine.data_field("mocap_pos")[0], start[0][0])
+    assert engine.data_field("mocap_pos")[1, 0, 2] == start[0][1, 0, 2] + 0.25
+
+
+def test_a_reset_forgets_velocities_that_were_not_finite() -> None:
+    # MuJoCo Warp's weld constraint reads body velocities before it computes them.
+    engine = make_engine(MOCAP)
+    engine.data_field("qvel")[0] = torch.nan
+    engine.step(2)
+    assert engine.data_field("cvel")[0].isnan().any()
+    engine.reset(torch.tensor([0]))
+    engine.forward(None)
+    assert engine.data_field("qacc").isfinite().all()
+
+
+def test_nan_in_one_environment_leaves_the_others_alone() -> None:
+    clean, spoiled = (on_the_floor(make_engine(LANDING_BOX, num_envs=3)) for _ in range(2))
+    spoiled.data_field("qpos")[1] = torch.nan
+    for engine in (clean, spoiled):
+        engine.step(5)
+    assert spoiled.data_field("qpos")[1].isnan().any(), "Warp must not repair it by itself"
+    for field in ("qpos", "qvel", "sensordata"):
+        torch.testing.assert_close(
+            spoiled.data_field(field)[[0, 2]], clean.data_field(field)[[0, 2]]
+        )
+
+
+def test_constants_of_other_environments_stay_as_they_are() -> None:
+    engine = make_engine(HINGE_CHAIN, num_envs=3)
+    engine.expand(("body_mass",))
+    engine.model_field("body_mass").mul_(2.0)
+    before = {"qpos": engine.data_field("qpos").clone(), "qvel": engine.data_field("qvel").clone()}
+    engine.expand(engine.constants_written_by(3))
+    old = engine.model_field("body_subtreemass").clone()
+    engine.recompute_constants(3, torch.tensor([1]))
+    new = engine.model_field("body_subtreemass")
+    assert torch.equal(new[[0, 2]], old[[0, 2]])
+    torch.testing.assert_close(new[1], 2 * old[1])
+    for field, value in before.items():
+        assert torch.equal(engine.data_field(field), value)
+
+
+def test_every_environment_gets_its_own_constants() -> None:
+    # A field that stayed shared would hold the first environment's values in all of them.
+    engine = make_engine(HINGE_CHAIN, num_envs=2)
+    engine.expand(("body_mass",))
+    engine.model_field("body_mass")[1].mul_(3.0)
+    engine.recompute_constants(3, None)
+    written = [*engine.constants_written_by(3), "stat.meaninertia"]
+    differing = {
+        field
+        for field in written
+        if not torch.equal(engine.model_field(field)[0], engine.model_field(field)[1])
+    }
+    assert differing >= {
+        "body_subtreemass",
+        "body_invweight0",
+        "dof_invweight0",
+        "actuator_acc0",
+        "stat.meaninertia",
+    }
+
+
+def test_a_saved_state_continues_bit_for_bit() -> None:
+    first = on_the_floor(make_engine(LANDING_BOX))
+    first.expand(("body_mass",))
+    first.model_field("body_mass")[1].mul_(1.5)
+    first.recompute_constants(3, None)
+    first.step(3)
+    saved = first.state_dict()
+    first.step(4)
+    second = make_engine(LANDING_BOX)
+    second.load_state_dict(saved)
+    second.step(4)
+    for field in ("time", "qpos", "qvel", "sensordata", "qacc_warmstart"):
+        assert torch.equal(first.data_field(field), second.data_field(field)), field
+
+
+def test_a_saved_state_of_another_size_is_refused() -> None:
+    saved = make_engine(CARTPOLE, num_envs=3).state_dict()
+    with pytest.raises(ValueError, match="--num-envs"):
+        make_engine(CARTPOLE, num_envs=2).load_state_dict(saved)
+
+
+def test_the_host_gets_one_environments_state() -> None:
+    engine = make_engine(MOCAP)
+    engine.data_field("qpos")[1, 0] = 0.3
+    engine.data_field("mocap_pos")[1, 0, 1] = 0.4
+    engine.step(2)
+    host = mujoco.MjData(mujoco.MjModel.from_xml_string(MOCAP))
+    engine.copy_to_host(1, host)
+    assert host.time == pytest.approx(0.004)
+    assert host.mocap_pos[0, 1] == pytest.approx(0.4)
+    torch.testing.assert_close(torch.as_tensor(host.qpos).float(), engine.data_field("qpos")[1])
+
+
+def test_rays_hit_only_the_groups_and_bodies_asked_for() -> None:
+    engine = make_engine(LANDING_BOX)
+    down = torch.tensor([0.0, 0.0, -1.0]).expand(2, 2, 3)
+    start = torch.tensor([-0.05, 0.1, 2.0]).expand(2, 2, 3)
+    distances, normals, geoms = engine.raycast(start, down, None, torch.tensor([-1, 1]))
+    torch.testing.assert_close(distances, torch.tensor([[1.55, 2.0]] * 2))
+    assert geoms.tolist() == [[1, 0]] * 2
+    torch.testing.assert_close(normals, torch.tensor([0.0, 0.0, 1.0]).expand(2, 2, 3))
+    distances, normals, geoms = engine.raycast(start, down, (3,), None)
+    assert (distances == -1).all()
+    assert (geoms == -1).all()
+    assert not normals.any()
+
+
+def test_rotation_matrices_are_mujocos() -> None:
+    quat = torch.nn.functional.normalize(torch.randn(5, 4, dtype=torch.float64), dim=-1)
+    for row in quat:
+        expected = torch.empty(9, dtype=torch.float64)
+        mujoco.mju_quat2Mat(expected.numpy(), row.numpy())
+        torch.testing.assert_close(rotation_matrices(row), expected.view(3, 3))
+
+
+# Names for packages that hold Warp arrays themselves.
+
+
+def test_a_torch_array_is_indexed_and_computed_with_as_a_tensor() -> None:
+    engine = make_engine(CARTPOLE)
+    array = TorchArray(engine.wp_data.qpos)
+    array[:, 1] = 2.0
+    assert engine.data_field("qpos")[:, 1].tolist() == [2.0, 2.0]
+    assert array.shape == (2, 2)
+    assert torch.equal(array + 1, engine.data_field("qpos") + 1)
+    assert torch.equal(torch.cos(array), engine.data_field("qpos").cos())
+    assert torch.equal(1.0 - array, 1.0 - engine.data_field("qpos"))
+    assert (array > 1.0)[:, 1].all()
+    assert array.wp_array is engine.wp_data.qpos
+
+
+def test_a_bridge_wraps_arrays_and_refuses_to_write_a_shared_row() -> None:
+    engine = make_engine(CARTPOLE)
+    model = WarpBridge(engine.wp_model, nworld=2)
+    assert model.body_mass.shape == (2, 3)
+    assert model.nv == 2
+    with pytest.raises(RuntimeError, match="expand_model_fields"):
+        model.body_mass[0] = 1.0
+    with pytest.raises(AttributeError, match="in place"):
+        model.body_mass = torch.zeros(2, 3)
+    expand_model_fields(model, 2, ["body_mass"])
+    model.clear_cache()
+    model.body_mass[0] = 1.0
+    assert engine.wp_model.body_mass.numpy()[0].tolist() == [1.0] * 3
+    assert WarpBridge(engine.wp_data).qpos.shape == (2, 2)
+
+
+def test_importing_the_compatibility_names_loads_no_warp() -> None:
+    code = (
+        "import sys, mjlab.sim.sim_data, mjlab.sim.randomization, mjlab.sim\n"
+        "from mjlab.sim import TorchArray, WarpBridge\n"
+        "assert 'warp' not in sys.modules and 'mujoco_warp' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize(("wish", "quiet"), [(None, True), ("1", True), ("0", False)])
+def test_warp_is_quiet_unless_asked_otherwise(
+    wish: str | None, quiet: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import warp as wp
+
+    from mjlab.sim.engines.warp import _be_quiet
+
+    monkeypatch.setattr(wp.config, "log_level", wp.LOG_INFO)
+    if wish is None:
+        monkeypatch.delenv("MJLAB_WARP_QUIET", raising=False)
+    else:
+        monkeypatch.setenv("MJLAB_WARP_QUIET", wish)
+    _be_quiet()
+    assert (wp.config.log_level > wp.LOG_INFO) is quiet
+
+
+# On a GPU, the captured graphs. These do not run where there is none.
+
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")
+
+
+@needs_gpu
+@pytest.mark.parametrize("own_stream", [False, True])
+def test_graphs_on_the_gpu_compute_what_the_cpu_does(own_stream: bool) -> None:
+    model = mujoco.MjModel.from_xml_string(LANDING_BOX)
+    engines = [WarpEngine(model, 3, SimulationCfg(), device) for device in ("cpu", "cuda:0")]
+    stream = torch.cuda.Stream() if own_stream else torch.cuda.default_stream()
+    with torch.cuda.stream(stream):
+        for engine in engines:
+            on_the_floor(engine)
+            engine.step(4)
+            engine.expand(("body_mass", "geom_pos"))
+            engine.model_field("body_mass")[1].mul_(2.0)
+            engine.recompute_constants(3, None)
+            engine.reset(torch.tensor([0], device=engine.device))
+            engine.step(3)
+            engine.forward(None)
+        for field in ("time", "qpos", "qvel", "xpos", "sensordata"):
+            cpu, gpu = (engine.data_field(field).cpu() for engine in engines)
+            torch.testing.assert_close(gpu, cpu, atol=1e-3, rtol=1e-3)
+
+
+@needs_gpu
+def test_a_step_on_the_gpu_does_not_wait_for_it() -> None:
+    engine = WarpEngine(mujoco.MjModel.from_xml_string(LANDING_BOX), 3, SimulationCfg(), "cuda:0")
+    ids = torch.tensor([1], device="cuda:0")
+    engine.step(2)
+    engine.forward(None)
+    engine.reset(ids)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        engine.step(2)
+        engine.reset(ids)
+        engine.forward(None)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
