@@ -81,16 +81,24 @@ _NAMES: dict[str, dict[str, str]] = {
     "mjlab.viewer.viser": _VISER,
 }
 
-# Fields that a class once had, with what becomes of a value given for them. A translation gets
-# the value and the keyword arguments, which it may change; None means the value has no effect.
+# Fields that a class once had, with what becomes of a value given for them, in this order. A
+# translation gets the value and the keyword arguments, which it may change; None means that the
+# value has no effect.
 _Translation = Callable[[Any, dict[str, Any]], None]
 _REQUIRED_BEFORE_1_6 = {"contype": 1, "conaffinity": 1, "condim": 3, "priority": 0}
 
 
+_GAUSSIAN = {"class_name": "GaussianDistribution", "init_std": 1.0, "std_type": "scalar"}
+
+
 def _set_std(value: Any, fields: dict[str, Any], key: str) -> None:
-    distribution = dict(fields.get("distribution_cfg") or {"class_name": "GaussianDistribution"})
-    distribution[key] = value
-    fields["distribution_cfg"] = distribution
+    # Models were deterministic unless they said `stochastic`, and then ignored their noise.
+    if fields.get("distribution_cfg"):
+        fields["distribution_cfg"] = {**fields["distribution_cfg"], key: value}
+
+
+def _set_stochastic(value: Any, fields: dict[str, Any]) -> None:
+    fields["distribution_cfg"] = dict(fields.get("distribution_cfg") or _GAUSSIAN) if value else None
 
 
 _DROPPED_FIELDS: dict[str, dict[str, tuple[str, _Translation | None]]] = {
@@ -98,6 +106,7 @@ _DROPPED_FIELDS: dict[str, dict[str, tuple[str, _Translation | None]]] = {
         "domain_randomization": ("nothing: fields are expanded as the function declares", None)
     },
     "RslRlModelCfg": {
+        "stochastic": ("distribution_cfg (None for a deterministic model)", _set_stochastic),
         "init_noise_std": (
             "distribution_cfg={'init_std': ...}",
             functools.partial(_set_std, key="init_std"),
@@ -106,7 +115,6 @@ _DROPPED_FIELDS: dict[str, dict[str, tuple[str, _Translation | None]]] = {
             "distribution_cfg={'std_type': ...}",
             functools.partial(_set_std, key="std_type"),
         ),
-        "stochastic": ("distribution_cfg (None for a deterministic model)", None),
     },
     "MujocoCfg": {
         "multiccd": (
@@ -171,7 +179,7 @@ def accepts_older_fields(cls: C) -> C:
 
     @functools.wraps(plain_init)
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:
-        for name in dropped.keys() & kwargs.keys():
+        for name in [name for name in dropped if name in kwargs]:
             today, translate = dropped[name]
             value = kwargs.pop(name)
             _warn_once(f"{cls.__name__}.{name} is an older field; today use {today}.")

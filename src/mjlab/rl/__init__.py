@@ -1,0 +1,36 @@
+"""Learning: the adapter to rsl_rl, its configs, the runner, evaluation and export.
+
+Names are imported when they are first used, so that `mjlab.rl.config`, which task configs and
+command lines read, comes without torch.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mjlab.rl.config import EvaluationCfg as EvaluationCfg
+    from mjlab.rl.config import RslRlBaseRunnerCfg as RslRlBaseRunnerCfg
+    from mjlab.rl.config import RslRlModelCfg as RslRlModelCfg
+    from mjlab.rl.config import RslRlOnPolicyRunnerCfg as RslRlOnPolicyRunnerCfg
+    from mjlab.rl.config import RslRlPpoAlgorithmCfg as RslRlPpoAlgorithmCfg
+    from mjlab.rl.runner import MjlabOnPolicyRunner as MjlabOnPolicyRunner
+    from mjlab.rl.vecenv_wrapper import RslRlVecEnvWrapper as RslRlVecEnvWrapper
+
+_HOMES = {
+    "EvaluationCfg": "mjlab.rl.config",
+    "MjlabOnPolicyRunner": "mjlab.rl.runner",
+    "RslRlBaseRunnerCfg": "mjlab.rl.config",
+    "RslRlModelCfg": "mjlab.rl.config",
+    "RslRlOnPolicyRunnerCfg": "mjlab.rl.config",
+    "RslRlPpoAlgorithmCfg": "mjlab.rl.config",
+    "RslRlVecEnvWrapper": "mjlab.rl.vecenv_wrapper",
+}
+__all__ = sorted(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)

@@ -1,0 +1,163 @@
+"""Configs of a training run. They reach rsl_rl as dicts (`dataclasses.asdict`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from mjlab.compat import accepts_older_fields
+
+
+@accepts_older_fields
+@dataclass
+class RslRlModelCfg:
+    """A network: actor or critic."""
+
+    hidden_dims: tuple[int, ...] = (128, 128, 128)
+    """Width of each hidden layer."""
+    activation: str = "elu"
+    """Activation function between layers, by rsl_rl's name (`elu`, `relu`, `tanh`, ...)."""
+    obs_normalization: bool = False
+    """Whether observations are normalized by their running mean and standard deviation."""
+    cnn_cfg: dict[str, Any] | None = None
+    """Settings of the image encoder, for models that have one."""
+    distribution_cfg: dict[str, Any] | None = None
+    """Distribution of the output, as `{"class_name": "GaussianDistribution", "init_std": 1.0,
+    "std_type": "scalar"}`. None: the output is deterministic."""
+    rnn_type: str | None = None
+    """`lstm` or `gru` for a recurrent model (with `class_name="RNNModel"`)."""
+    rnn_hidden_dim: int = 256
+    """Width of the recurrent state."""
+    rnn_num_layers: int = 1
+    """Number of recurrent layers."""
+    class_name: str = "MLPModel"
+    """A class of rsl_rl, or `module:Class`."""
+
+
+@dataclass
+class RslRlPpoAlgorithmCfg:
+    """Proximal policy optimization."""
+
+    num_learning_epochs: int = 5
+    """Passes over the data of an iteration."""
+    num_mini_batches: int = 4
+    """Parts that the data of an iteration is split into."""
+    learning_rate: float = 1e-3
+    """Learning rate of the optimizer; the start value under the adaptive schedule."""
+    schedule: Literal["adaptive", "fixed"] = "adaptive"
+    """`adaptive` changes the learning rate to keep the policy change near `desired_kl`."""
+    gamma: float = 0.99
+    """Discount factor per environment step."""
+    lam: float = 0.95
+    """Decay of generalized advantage estimation."""
+    entropy_coef: float = 0.005
+    """Weight of the entropy bonus."""
+    desired_kl: float = 0.01
+    """Policy change per update that the adaptive schedule aims at (Kullback-Leibler)."""
+    max_grad_norm: float = 1.0
+    """Gradients are scaled down to this norm."""
+    value_loss_coef: float = 1.0
+    """Weight of the value loss."""
+    use_clipped_value_loss: bool = True
+    """Whether the value loss is clipped as the policy loss is."""
+    clip_param: float = 0.2
+    """Range of the probability ratio beyond which the policy loss is clipped."""
+    normalize_advantage_per_mini_batch: bool = False
+    """Normalize advantages within each mini-batch instead of over all data."""
+    optimizer: Literal["adam", "adamw", "sgd", "rmsprop"] = "adam"
+    """Optimizer."""
+    share_cnn_encoders: bool = False
+    """Whether actor and critic share their image encoders."""
+    class_name: str = "PPO"
+    """A class of rsl_rl, or `module:Class`."""
+
+
+@dataclass
+class EvaluationCfg:
+    """What counts as solved, and when training stops to look.
+
+    The return of an episode is the sum of its weighted rewards BEFORE they are multiplied by the
+    environment step: with rewards in [0, 1], an episode of 1000 steps has at most 1000.
+    """
+
+    solved_return: float | None = None
+    """Mean evaluation return from which the task counts as solved. None: nothing is evaluated."""
+    stop_when_solved: bool = True
+    """Whether training stops there."""
+    num_episodes: int = 256
+    """Episodes of an evaluation; each environment plays one, with the deterministic policy."""
+    trigger_fraction: float = 0.8
+    """An evaluation takes time, so it waits until the mean reward of the training data, times the
+    length of an episode, reaches this fraction of `solved_return`. Below 1, because training
+    explores."""
+    min_interval: int = 3
+    """Iterations from one evaluation to the next, at least."""
+    success_return: float | None = None
+    """Return from which one episode is a success. None: `solved_return`."""
+    success_func: Callable[[Any], Any] | None = None
+    """Instead of a return: `func(env) -> (num_envs,) bool`. The value one step before an episode
+    ends decides, because the environment has reset by the time its last step returns."""
+
+
+@dataclass
+class RslRlBaseRunnerCfg:
+    """A training run."""
+
+    seed: int = 42
+    """Seed of the run. The environment gets it too (plus the process rank on several GPUs)."""
+    num_steps_per_env: int = 24
+    """Environment steps per iteration."""
+    max_iterations: int = 300
+    """Iterations in total; those before a resume count."""
+    obs_groups: dict[str, tuple[str, ...]] = field(
+        default_factory=lambda: {"actor": ("actor",), "critic": ("critic",)}
+    )
+    """For each model, the observation groups that it gets, concatenated in this order."""
+    save_interval: int = 50
+    """Iterations from one checkpoint to the next."""
+    experiment_name: str = "exp1"
+    """Folder of the experiment, under the log root."""
+    run_name: str = ""
+    """Added to the name of the run folder, which is the time of its start."""
+    logger: Literal["wandb", "tensorboard"] = "tensorboard"
+    """Where figures go: `tensorboard` writes to the run folder only; `wandb` also uploads to
+    Weights & Biases. (mjlab 1.6 uploads by default.)"""
+    wandb_project: str = "mjlab"
+    """Project at Weights & Biases."""
+    wandb_tags: tuple[str, ...] = ()
+    """Tags of the run at Weights & Biases."""
+    resume: bool = False
+    """Continue from a checkpoint."""
+    load_run: str = ".*"
+    """Run folder to resume from: a regular expression, of which the newest match is taken."""
+    load_checkpoint: str = "model_.*.pt"
+    """Checkpoint to resume from: a regular expression, of which the newest match is taken."""
+    clip_actions: float | None = None
+    """Actions are clipped to plus and minus this before they reach the environment."""
+    upload_model: bool = True
+    """Whether checkpoints and exported policies are uploaded to Weights & Biases."""
+    evaluation: EvaluationCfg = field(default_factory=EvaluationCfg, kw_only=True)
+    """What counts as solved."""
+
+
+@dataclass
+class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
+    """A training run with an on-policy algorithm."""
+
+    class_name: str = "OnPolicyRunner"
+    """The runner, by rsl_rl's name."""
+    actor: RslRlModelCfg = field(
+        default_factory=lambda: RslRlModelCfg(
+            distribution_cfg={
+                "class_name": "GaussianDistribution",
+                "init_std": 1.0,
+                "std_type": "scalar",
+            }
+        )
+    )
+    """The policy network."""
+    critic: RslRlModelCfg = field(default_factory=RslRlModelCfg)
+    """The value network."""
+    algorithm: RslRlPpoAlgorithmCfg = field(default_factory=RslRlPpoAlgorithmCfg)
+    """The learning algorithm."""

@@ -1,0 +1,263 @@
+"""What a deployment has to know about an exported policy, written into the ONNX file.
+
+Each key is one string property of the file; lists are comma-separated. The keys of mjlab 1.6 come
+first, in its order and layout; numbers have full precision, and more keys follow:
+
+| key | value |
+| --- | --- |
+| action_names, action_types, action_entities, action_dims | per action term |
+| action_target_names, action_offset, action_clip | per component of the action vector |
+| observation_group | the group that the policy reads |
+| observation_dims | size of each of its terms, history included |
+| observation_delay | lowest and highest lag of each term, in steps |
+| step_dt, physics_dt, decimation | control period (s), physics time step (s), their ratio |
+
+A term's target is `action * action_scale + action_offset`, clipped to `action_clip`.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+    from mjlab.envs import ManagerBasedRlEnv
+
+Metadata = dict[str, list | str | float]
+
+logger = logging.getLogger(__name__)
+
+
+def list_to_csv_str(
+    arr: Any, *, decimals: int | None = 3, delimiter: str = ",", sub_delimiter: str = ";"
+) -> str:
+    """Return the items of `arr`, joined by `delimiter`; nested lists by `sub_delimiter`.
+
+    Numbers get `decimals` decimals, booleans counting as 1 and 0; None writes them in full, as
+    short as reads back to the same number. Everything else is `str`.
+    """
+    return delimiter.join(
+        list_to_csv_str(item, decimals=decimals, delimiter=sub_delimiter)
+        if isinstance(item, (list, tuple))
+        else _item_to_str(item, decimals)
+        for item in _as_list(arr)
+    )
+
+
+def _item_to_str(item: Any, decimals: int | None) -> str:
+    if not isinstance(item, (bool, int, float, np.bool_, np.number)):
+        return str(item)
+    if decimals is not None:
+        return f"{item:.{decimals}f}"
+    if isinstance(item, (bool, np.bool_)):
+        return str(int(item))
+    return str(item)
+
+
+def _as_list(values: Any) -> list:
+    return values.tolist() if hasattr(values, "tolist") else list(values)
+
+
+def attach_metadata_to_onnx(onnx_path: str, metadata: Mapping[str, list | str | float]) -> None:
+    """Write `metadata` into the ONNX file; keys that it has already are replaced.
+
+    The file is replaced as a whole, so it is never seen half written.
+    """
+    import onnx
+
+    model = onnx.load(onnx_path)
+    kept = {entry.key: entry.value for entry in model.metadata_props}
+    new = {
+        key: list_to_csv_str(value, decimals=None)
+        if isinstance(value, (list, tuple))
+        else _item_to_str(value, None)
+        for key, value in metadata.items()
+    }
+    del model.metadata_props[:]
+    for key, value in {**kept, **new}.items():
+        model.metadata_props.add(key=key, value=value)
+    write_atomically(Path(onnx_path), model.SerializeToString())
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write `content` to `path` through a temporary file in the same folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def get_base_metadata(env: ManagerBasedRlEnv, run_path: str) -> Metadata:
+    """Return what a deployment needs to run a policy of `env`, whatever the task has.
+
+    Args:
+        env: The environment; environment 0 stands for all.
+        run_path: Name of the run, or "local".
+
+    Joint keys are those of the entity that the actions drive: the one called "robot" if it is
+    among them, else that of the first action term.
+    """
+    metadata: Metadata = {"run_path": run_path}
+    entity = _controlled_entity(env)
+    if entity is not None:
+        metadata.update(_joint_metadata(env, entity))
+    metadata["command_names"] = list(env.command_manager.active_terms)
+    metadata.update(_observation_metadata(env))
+    metadata.update(_action_metadata(env))
+    metadata["step_dt"] = _shortest(env.step_dt)
+    metadata["physics_dt"] = _shortest(env.physics_dt)
+    metadata["decimation"] = env.cfg.decimation
+    return metadata
+
+
+def _action_terms(env: ManagerBasedRlEnv) -> dict[str, Any]:
+    return {name: env.action_manager.get_term(name) for name in env.action_manager.active_terms}
+
+
+def _controlled_entity(env: ManagerBasedRlEnv) -> Entity | None:
+    names = [term.cfg.entity_name for term in _action_terms(env).values()]
+    if not names:
+        return None
+    return env.scene["robot" if "robot" in names else names[0]]
+
+
+def _joint_metadata(env: ManagerBasedRlEnv, entity: Entity) -> Metadata:
+    stiffness, damping = _gains_by_joint(env, entity)
+    actuated = [name for name in entity.joint_names if name in stiffness]
+    default = entity.data.default_joint_pos
+    return {
+        "joint_names": list(entity.joint_names),
+        "joint_stiffness": [stiffness[name] for name in actuated],
+        "joint_damping": [damping[name] for name in actuated],
+        "default_joint_pos": _numbers(default[0]) if default is not None else [],
+    }
+
+
+def _gains_by_joint(
+    env: ManagerBasedRlEnv, entity: Entity
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return PD gains as configured (not as randomized) by joint; 0 for an actuator without."""
+    stiffness: dict[str, float] = {}
+    damping: dict[str, float] = {}
+    model = env.sim.mj_model
+    for actuator in entity.actuators:
+        if str(getattr(actuator.transmission_type, "value", "joint")) != "joint":
+            continue
+        elements = actuator.global_ctrl_ids.tolist()
+        for k, name in enumerate(actuator.target_names):
+            # Elements of one target follow each other; the first holds the gains.
+            element = elements[k * len(elements) // len(actuator.target_names)]
+            kp, kd = _mujoco_gains(model, element)
+            # A PD law that is computed outside MuJoCo is not in the model, but in the config.
+            stiffness[name] = float(getattr(actuator.cfg, "stiffness", kp))
+            damping[name] = float(getattr(actuator.cfg, "damping", kd))
+    return stiffness, damping
+
+
+def _mujoco_gains(model: Any, element: int) -> tuple[float, float]:
+    """Return kp and kd of the affine bias -kp l - kd l' of a position or velocity servo."""
+    affine = 1  # mujoco.mjtBias.mjBIAS_AFFINE
+    if int(model.actuator_biastype[element]) != affine:
+        return 0.0, 0.0
+    bias = model.actuator_biasprm[element]
+    return float(0.0 - bias[1]), float(0.0 - bias[2])
+
+
+def _observation_metadata(env: ManagerBasedRlEnv) -> Metadata:
+    manager = env.observation_manager
+    group = "actor" if "actor" in manager.active_terms else next(iter(manager.active_terms), None)
+    if group is None:
+        return {}
+    names = manager.active_terms[group]
+    cfgs = [manager.get_term_cfg(group, name) for name in names]
+    return {
+        "observation_names": list(names),
+        "observation_terms_scale": [_scale(cfg.scale) for cfg in cfgs],
+        "observation_terms_flatten_history_dim": [cfg.flatten_history_dim for cfg in cfgs],
+        "observation_terms_history_length": [cfg.history_length for cfg in cfgs],
+        "observation_terms_clip": [
+            list(cfg.clip) if cfg.clip is not None else [-np.inf, np.inf] for cfg in cfgs
+        ],
+        "observation_group": group,
+        "observation_dims": [int(np.prod(dim)) for dim in manager.group_obs_term_dim[group]],
+        "observation_delay": [[cfg.delay_min_lag, cfg.delay_max_lag] for cfg in cfgs],
+    }
+
+
+def _scale(scale: Any) -> float | list[float]:
+    if scale is None:
+        return 1.0
+    if isinstance(scale, torch.Tensor):
+        return _numbers(scale) if scale.ndim > 0 else _shortest(scale.item())
+    return list(scale) if isinstance(scale, (list, tuple)) else float(scale)
+
+
+def _action_metadata(env: ManagerBasedRlEnv) -> Metadata:
+    terms = _action_terms(env)
+    scales = [getattr(term, "_scale", 1.0) for term in terms.values()]
+    several = len({term.cfg.entity_name for term in terms.values()}) > 1
+    components: dict[str, list] = {"names": [], "scale": [], "offset": [], "clip": []}
+    for name, term in terms.items():
+        prefix = f"{term.cfg.entity_name}/" if several else ""
+        components["names"] += [prefix + target for target in _target_names(name, term)]
+        components["scale"] += _per_component(term, "_scale", 1.0)
+        components["offset"] += _per_component(term, "_offset", 0.0)
+        components["clip"] += _clip_per_component(term)
+    # One number where one number was configured, as mjlab 1.6 writes it.
+    single = len(scales) == 1 and isinstance(scales[0], (int, float))
+    return {
+        "action_scale": float(scales[0]) if single else components["scale"],
+        "action_names": list(terms),
+        "action_types": [type(term).__name__ for term in terms.values()],
+        "action_entities": [term.cfg.entity_name for term in terms.values()],
+        "action_dims": [term.action_dim for term in terms.values()],
+        "action_target_names": components["names"],
+        "action_offset": components["offset"],
+        "action_clip": components["clip"],
+    }
+
+
+def _target_names(name: str, term: Any) -> list[str]:
+    """Return what each component drives; terms that drive no named thing number them."""
+    names: list[str] = list(getattr(term, "_target_names", ()))
+    if len(names) == term.action_dim:
+        return names
+    return [f"{name}_{k}" for k in range(term.action_dim)]
+
+
+def _per_component(term: Any, attribute: str, default: float) -> list[float]:
+    value = getattr(term, attribute, default)
+    if isinstance(value, torch.Tensor):
+        row = value[0] if value.ndim > 1 else value
+        return _numbers(row.expand(term.action_dim))
+    return [float(value)] * term.action_dim
+
+
+def _clip_per_component(term: Any) -> list[list[float]]:
+    clip = getattr(term, "_clip", None)
+    if not isinstance(clip, torch.Tensor):
+        return [[-np.inf, np.inf]] * term.action_dim
+    return [_numbers(bounds) for bounds in clip[0]]
+
+
+def _numbers(values: torch.Tensor) -> list[float]:
+    return [_shortest(value) for value in values.flatten().tolist()]
+
+
+def _shortest(value: float) -> float:
+    """Return the number with the fewest digits that is `value` in float32: 0.1, not 0.100000001."""
+    return float(str(np.float32(value)))

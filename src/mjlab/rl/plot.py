@@ -1,0 +1,160 @@
+"""Learning curves, drawn from the event files of runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+DEFAULT_TAG = "Train/mean_step_reward"
+_LABELS = {
+    DEFAULT_TAG: "Mean reward per step",
+    "Train/mean_reward": "Mean reward of an episode",
+    "Train/mean_episode_length": "Mean episode length (steps)",
+    "Evaluation/mean_return": "Mean evaluation return",
+}
+
+Curve = tuple[np.ndarray, np.ndarray]
+
+
+def read_scalars(run_dir: str | Path, tag: str) -> Curve:
+    """Return iterations and values of `tag` from the event files in `run_dir`.
+
+    Where an iteration was written more than once, as after a resume into the same folder, the
+    last value counts.
+
+    Raises:
+        ValueError: there are no event files, or they have no such tag; the tags are listed.
+    """
+    from tensorboard.backend.event_processing import event_accumulator
+
+    run_dir = Path(run_dir)
+    if not any(run_dir.glob("events.out.tfevents.*")):
+        raise ValueError(
+            f"There are no TensorBoard event files in {str(run_dir)!r}; give the folder of a run, "
+            "such as logs/rsl_rl/<experiment>/<time>."
+        )
+    # Zero keeps every value instead of a sample.
+    accumulator = event_accumulator.EventAccumulator(
+        str(run_dir), size_guidance={event_accumulator.SCALARS: 0}
+    )
+    accumulator.Reload()
+    tags = accumulator.Tags()["scalars"]
+    if tag not in tags:
+        raise ValueError(f"The run {str(run_dir)!r} has no figure {tag!r}. Figures: {tags}.")
+    by_iteration = {event.step: event.value for event in accumulator.Scalars(tag)}
+    iterations = sorted(by_iteration)
+    return np.array(iterations), np.array([by_iteration[i] for i in iterations], dtype=float)
+
+
+def plot_run(
+    run_dir: str | Path,
+    output: str | Path | None = None,
+    *,
+    tag: str = DEFAULT_TAG,
+    title: str | None = None,
+) -> Path:
+    """Draw the learning curve of one run.
+
+    Args:
+        run_dir: Folder of the run.
+        output: The PNG; None: `<run_dir>/learning_curve.png`.
+        tag: Figure to draw, as it is called in the event files.
+        title: Title of the figure; None: the folder's name.
+
+    Returns:
+        The PNG.
+
+    Raises:
+        ValueError: see `read_scalars`.
+    """
+    run_dir = Path(run_dir)
+    curve = read_scalars(run_dir, tag)
+    output = run_dir / "learning_curve.png" if output is None else Path(output)
+
+    def draw(axes: Axes) -> None:
+        axes.plot(curve[0] + 1, curve[1])
+
+    _draw_figure(draw, output, tag, run_dir.resolve().name if title is None else title)
+    return output
+
+
+def plot_seeds(
+    run_dirs: Sequence[str | Path] | Mapping[str, Sequence[str | Path]],
+    output: str | Path,
+    *,
+    tag: str = DEFAULT_TAG,
+    title: str | None = None,
+) -> Path:
+    """Draw the mean over runs that differ in their seed, with one standard deviation shaded.
+
+    A run that stopped early keeps its last value, because a task that is solved stays solved: so
+    the mean is over all runs at every iteration.
+
+    Args:
+        run_dirs: Folders of the runs; or several such lists by name, one curve each.
+        output: The PNG.
+        tag: Figure to draw, as it is called in the event files.
+        title: Title of the figure; None: the number of seeds.
+
+    Returns:
+        The PNG.
+
+    Raises:
+        ValueError: no runs are given, or see `read_scalars`.
+    """
+    groups = run_dirs if isinstance(run_dirs, Mapping) else {"": run_dirs}
+    if not groups or not all(groups.values()):
+        raise ValueError("There are no runs to draw; give the folder of at least one.")
+    curves = {
+        name: mean_and_std([read_scalars(run, tag) for run in runs])
+        for name, runs in groups.items()
+    }
+    seeds = max(len(runs) for runs in groups.values())
+
+    def draw(axes: Axes) -> None:
+        for name, (iterations, mean, std) in curves.items():
+            (line,) = axes.plot(iterations + 1, mean, label=name or None)
+            axes.fill_between(
+                iterations + 1, mean - std, mean + std, alpha=0.25, color=line.get_color(), lw=0
+            )
+        if any(curves):
+            axes.legend()
+
+    output = Path(output)
+    default = f"Mean over {seeds} seeds (shaded: one standard deviation)"
+    _draw_figure(draw, output, tag, default if title is None else title)
+    return output
+
+
+def mean_and_std(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return iterations, mean and standard deviation over `curves`, at every iteration any has.
+
+    Between its points a curve is linear; before its first and after its last it is constant.
+    """
+    iterations = np.unique(np.concatenate([curve[0] for curve in curves]))
+    values = np.stack([np.interp(iterations, *curve) for curve in curves])
+    return iterations, values.mean(axis=0), values.std(axis=0)
+
+
+def _draw_figure(draw, output: Path, tag: str, title: str) -> None:
+    # The figure is made without pyplot, which would choose a window system and keep the figure.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 4.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    draw(axes)
+    axes.set_xlabel("Iteration")
+    axes.set_ylabel(_LABELS.get(tag, tag))
+    axes.set_title(title)
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(output, dpi=150)

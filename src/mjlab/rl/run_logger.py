@@ -1,0 +1,226 @@
+"""The log of a run: TensorBoard events (and Weights & Biases on request), episode statistics."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import statistics
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from mjlab.rl.checkpoint import ensure_writable_folder
+from mjlab.rl.progress import IterationStats
+from mjlab.rl.rsl import Logger, enable_wandb
+
+if TYPE_CHECKING:
+    from mjlab.rl.evaluate import EvaluationResult
+
+logger = logging.getLogger(__name__)
+
+
+class RunLogger(Logger):
+    """rsl_rl's logger, silent on the console and without a GPU synchronization per step.
+
+    What an iteration's steps report stays on the device until `finish_iteration` reads it all at
+    once. Tags in the event files are rsl_rl's, and `Train/mean_step_reward` besides.
+    """
+
+    def __init__(self, *args: Any, reward_unit: float = 1.0, **kwargs: Any) -> None:
+        """Take rsl_rl's arguments, and what one unit of weighted reward is worth in the rewards
+        that `process_env_step` gets (the step's duration, where rewards are scaled by it)."""
+        super().__init__(*args, **kwargs)
+        self._reward_unit = reward_unit
+        self._session_time = 0.0
+        self._finished: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]] = []
+        self._step_rewards: list[torch.Tensor] = []
+        self._write_failed = False
+
+    def init_logging_writer(self) -> None:
+        """Open the event file.
+
+        Raises:
+            RunFolderError: the run folder cannot be written to.
+            ModuleNotFoundError: Weights & Biases is asked for and not installed.
+        """
+        if self.log_dir is not None and not self.disable_logs:
+            ensure_writable_folder(self.log_dir)
+            self.cfg["logger"] = self._writer_config()
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            super().init_logging_writer()
+        for line in filter(None, printed.getvalue().splitlines()):
+            logger.debug("%s", line)
+
+    def _writer_config(self) -> str | dict[str, Any]:
+        wanted = self.cfg.get("logger", "tensorboard")
+        if wanted == "wandb":
+            wanted = {
+                "class_name": "WandbLogWriter",
+                "project_name": self.cfg.get("wandb_project"),
+            }
+        if isinstance(wanted, dict) and wanted.get("class_name") == "WandbLogWriter":
+            enable_wandb()
+        return wanted
+
+    def process_env_step(
+        self,
+        rewards: torch.Tensor,
+        dones: torch.Tensor,
+        extras: dict[str, Any],
+        intrinsic_rewards: torch.Tensor | None = None,
+    ) -> None:
+        """Add one step of all environments; `rewards` and `dones` have shape (num_envs,)."""
+        logged = extras.get("episode", extras.get("log"))
+        if logged:
+            self.ep_extras.append(logged)
+        self._step_rewards.append(rewards.mean())
+        done = dones > 0
+        self.cur_reward_sum += rewards
+        if intrinsic_rewards is not None:
+            self.cur_reward_sum += intrinsic_rewards
+        self.cur_episode_length += 1
+        self._finished.append((done, self.cur_reward_sum.clone(), self.cur_episode_length.clone()))
+        self.cur_reward_sum.masked_fill_(done, 0.0)
+        self.cur_episode_length.masked_fill_(done, 0.0)
+
+    def finish_iteration(
+        self,
+        *,
+        iteration: int,
+        first_iteration: int,
+        total_iterations: int,
+        collection_time: float,
+        learning_time: float,
+        losses: dict[str, float],
+        learning_rate: float,
+        action_std: torch.Tensor,
+        rnd_weight: float | None,
+    ) -> IterationStats:
+        """Write the figures of iteration number `iteration` (from 0), and return them."""
+        steps = int(self.cfg["num_steps_per_env"]) * self.num_envs * self.gpu_world_size
+        duration = collection_time + learning_time
+        self.tot_timesteps += steps
+        self.tot_time += duration
+        self._session_time += duration
+        per_iteration = self._session_time / (iteration + 1 - first_iteration)
+        self._collect_finished_episodes()
+        stats = IterationStats(
+            iteration=iteration + 1,
+            total_iterations=total_iterations,
+            total_steps=self.tot_timesteps,
+            collection_time=collection_time,
+            learning_time=learning_time,
+            steps_per_second=steps / max(duration, 1e-9),
+            time_left=per_iteration * (total_iterations - iteration - 1),
+            mean_reward=statistics.fmean(self.rewbuffer) if self.rewbuffer else None,
+            mean_episode_length=statistics.fmean(self.lenbuffer) if self.lenbuffer else None,
+            mean_step_reward=self._mean_step_reward(),
+            learning_rate=learning_rate,
+            action_std=action_std.mean().item(),
+            losses=losses,
+            environment=self._environment_means(),
+        )
+        self._write(stats, iteration, rnd_weight)
+        return stats
+
+    def _collect_finished_episodes(self) -> None:
+        if not self._finished:
+            return
+        done, sums, lengths = (torch.stack(column) for column in zip(*self._finished, strict=True))
+        self._finished.clear()
+        self.rewbuffer.extend(sums[done].tolist())
+        self.lenbuffer.extend(lengths[done].tolist())
+
+    def _mean_step_reward(self) -> float:
+        if not self._step_rewards:
+            return 0.0
+        mean = torch.stack(self._step_rewards).mean().item()
+        self._step_rewards.clear()
+        return mean / self._reward_unit
+
+    def _environment_means(self) -> dict[str, float]:
+        values: dict[str, list[torch.Tensor]] = {}
+        for step in self.ep_extras:
+            for name, value in step.items():
+                tensor = torch.as_tensor(value, dtype=torch.float32, device=self.device)
+                values.setdefault(name, []).append(tensor.flatten())
+        self.ep_extras.clear()
+        if not values:
+            return {}
+        means = torch.stack([torch.cat(parts).mean() for parts in values.values()]).tolist()
+        names = [name if "/" in name else f"Episode/{name}" for name in values]
+        return dict(zip(names, means, strict=True))
+
+    def _write(self, stats: IterationStats, iteration: int, rnd_weight: float | None) -> None:
+        scalars = {
+            **stats.environment,
+            **{f"Loss/{name}": value for name, value in stats.losses.items()},
+            "Loss/learning_rate": stats.learning_rate,
+            "Policy/mean_std": stats.action_std,
+            "Perf/total_fps": int(stats.steps_per_second),
+            "Perf/collection_time": stats.collection_time,
+            "Perf/learning_time": stats.learning_time,
+            "Train/mean_step_reward": stats.mean_step_reward,
+        }
+        if stats.mean_reward is not None and stats.mean_episode_length is not None:
+            scalars["Train/mean_reward"] = stats.mean_reward
+            scalars["Train/mean_episode_length"] = stats.mean_episode_length
+        if rnd_weight is not None:
+            scalars["Rnd/weight"] = rnd_weight
+        self.write_scalars(scalars, iteration)
+
+    def write_scalars(self, scalars: dict[str, float], iteration: int) -> None:
+        """Write `scalars` to the event file, if this process has one.
+
+        A disk that is full does not end training here: the next checkpoint says it clearly.
+        """
+        if self.writer is None or self._write_failed:
+            return
+        try:
+            for tag, value in scalars.items():
+                self.writer.add_scalar(tag, value, iteration)
+        except OSError as error:
+            self._write_failed = True
+            logger.warning("Figures are no longer written to %s: %s", self.log_dir, error)
+
+    def write_evaluation(self, result: EvaluationResult, iteration: int) -> None:
+        """Write the figures of an evaluation after iteration number `iteration` (from 0)."""
+        scalars = {
+            "Evaluation/mean_return": result.mean_return,
+            "Evaluation/mean_length": result.mean_length,
+        }
+        if result.success_rate is not None:
+            scalars["Evaluation/success_rate"] = result.success_rate
+        self.write_scalars(scalars, iteration)
+
+    def stop_logging_writer(self) -> None:
+        """Flush and close the event file."""
+        super().stop_logging_writer()
+        close = getattr(self.writer, "close", None)
+        if close is None:
+            return
+        try:
+            close()
+        except OSError as error:
+            logger.warning("The event file in %s was not closed: %s", self.log_dir, error)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what the curves of a resumed run need to go on as they were."""
+        return {
+            "total_steps": self.tot_timesteps,
+            "total_time": self.tot_time,
+            "rewards": list(self.rewbuffer),
+            "lengths": list(self.lenbuffer),
+            "reward_sums": self.cur_reward_sum.clone(),
+            "episode_lengths": self.cur_episode_length.clone(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore `state_dict` of a run with as many environments."""
+        self.tot_timesteps = state["total_steps"]
+        self.tot_time = state["total_time"]
+        self.rewbuffer.extend(state["rewards"])
+        self.lenbuffer.extend(state["lengths"])
+        self.cur_reward_sum.copy_(state["reward_sums"])
+        self.cur_episode_length.copy_(state["episode_lengths"])

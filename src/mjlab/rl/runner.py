@@ -1,0 +1,465 @@
+"""The training run: collect, learn, save; and pick up exactly where a run left off."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import os
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mjlab.rl import training_state
+from mjlab.rl.checkpoint import (
+    CheckpointError,
+    ensure_writable_folder,
+    load_checkpoint,
+    save_checkpoint,
+)
+from mjlab.rl.evaluate import EvaluationResult, reward_unit
+from mjlab.rl.exporter_utils import attach_metadata_to_onnx, get_base_metadata
+from mjlab.rl.migration import check_fits, migrate
+from mjlab.rl.onnx_export import export_to_onnx
+from mjlab.rl.progress import IterationStats, TrainingObserver
+from mjlab.rl.rsl import (
+    OnPolicyRunner,
+    TensorDict,
+    VecEnv,
+    check_nan,
+    enable_torch_compile,
+    keep_compiler_out_of_step,
+)
+from mjlab.rl.run_logger import RunLogger
+from mjlab.rl.solved import SolvedCheck
+from mjlab.rl.stop_request import StopRequest
+from mjlab.rl.threads import torch_threads, using_torch_threads
+
+logger = logging.getLogger(__name__)
+
+_RECURRENT_KEYS = ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")
+# What `learn` ends with, in the order in which one outweighs another between processes.
+_REASONS = ("", "solved", "interrupted")
+
+
+class MjlabOnPolicyRunner(OnPolicyRunner):
+    """Trains a policy with rsl_rl's algorithms.
+
+    Unlike rsl_rl's runner it counts iterations in total: `learn(10)` does the same, bit for bit,
+    as `learn(5)`, `load` in a new process, and `learn(10)`. `current_learning_iteration` is the
+    number of iterations finished. Progress goes to `observers` instead of the console.
+
+    After `learn`, `stop_reason` is `finished`, `solved`, `interrupted` (SIGINT or SIGTERM) or
+    `failed`, and `last_evaluation` the last evaluation's result, if there was one.
+    """
+
+    # Any: an environment has more than rsl_rl's `VecEnv` says (`unwrapped`).
+    env: Any
+
+    def __init__(
+        self, env: VecEnv, train_cfg: dict, log_dir: str | None = None, device: str = "cpu"
+    ) -> None:
+        """Build networks and algorithm.
+
+        Args:
+            env: The environments.
+            train_cfg: A `RslRlOnPolicyRunnerCfg` as a dict; it is edited here and by rsl_rl.
+            log_dir: Folder of the run. None: nothing is written.
+            device: Device of the networks.
+        """
+        _drop_unused_keys(train_cfg)
+        if train_cfg.get("torch_compile_mode"):
+            enable_torch_compile()
+        with _printing_to_log():
+            super().__init__(env, train_cfg, log_dir, device)
+        if not train_cfg.get("torch_compile_mode"):
+            keep_compiler_out_of_step(self.alg.optimizer)
+        self.logger: RunLogger = RunLogger(
+            log_dir=log_dir,
+            cfg=self.cfg,
+            env_cfg=self.env.cfg,
+            num_envs=self.env.num_envs,
+            is_distributed=self.is_distributed,
+            gpu_world_size=self.gpu_world_size,
+            gpu_global_rank=self.gpu_global_rank,
+            device=self.device,
+            reward_unit=reward_unit(self.env),
+        )
+        self.observers: list[TrainingObserver] = []
+        self.stop_reason: str | None = None
+        self.last_evaluation: EvaluationResult | None = None
+        self._observations: TensorDict | None = None
+        self._state_to_resume: dict[str, Any] | None = None
+        self._solved_check = SolvedCheck(
+            env, self.alg, self.cfg.get("evaluation") or {}, int(self.cfg.get("seed", 0))
+        )
+        self._num_threads = self._resolve_threads()
+
+    # The training loop.
+
+    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
+        """Train until `num_learning_iterations` iterations are finished IN TOTAL.
+
+        Iterations before a `load` count. SIGINT and SIGTERM end training after the running
+        iteration; a second one ends the process. In every case a checkpoint that resumes exactly
+        is written, and the policy exported.
+
+        Args:
+            num_learning_iterations: Total number of iterations.
+            init_at_random_ep_len: Start environments at random points of their episodes, so that
+                they do not all reset together. Has no effect where episodes are resumed.
+
+        Raises:
+            RunFolderError: the run folder cannot be written to; raised before any training.
+            CheckpointError: a checkpoint could not be written.
+            ValueError: the environment returned NaN.
+        """
+        first = self.current_learning_iteration
+        if self._writes and self.logger.log_dir is not None:
+            ensure_writable_folder(self.logger.log_dir)
+        self.logger.init_logging_writer()
+        self.stop_reason = "failed"
+        try:
+            with (
+                using_torch_threads(self._num_threads),
+                StopRequest(lambda name: self._tell("on_stop_requested", name)) as stop,
+            ):
+                observations = self._start(init_at_random_ep_len)
+                self._tell("on_start", first, num_learning_iterations)
+                reason = ""
+                for iteration in range(first, num_learning_iterations):
+                    begin = time.perf_counter()
+                    with torch.inference_mode():
+                        observations = self._collect(observations)
+                        collected = time.perf_counter()
+                        self.alg.compute_returns(observations)
+                    losses = self.alg.update()
+                    learned = time.perf_counter()
+                    self._observations = observations
+                    self.current_learning_iteration = iteration + 1
+                    stats = self._report(
+                        iteration, first, num_learning_iterations,
+                        collected - begin, learned - collected, losses,
+                    )  # fmt: skip
+                    reason = self._reason_to_stop(stop, stats)
+                    if reason or iteration + 1 == num_learning_iterations:
+                        break
+                    if iteration % self.cfg["save_interval"] == 0:
+                        self._save_checkpoint()
+                self._finish(first, num_learning_iterations)
+                self.stop_reason = reason or "finished"
+        finally:
+            self.logger.stop_logging_writer()
+            self._solved_check.close()
+            self._tell("on_end", self.stop_reason)
+
+    def _start(self, init_at_random_ep_len: bool) -> TensorDict:
+        """Return the observations to start from: resumed ones, or those of the environments."""
+        self.alg.train_mode()
+        if self.is_distributed:
+            self.alg.broadcast_parameters()
+        observations = self._resumed_observations()
+        if observations is None:
+            if init_at_random_ep_len:
+                lengths = self.env.episode_length_buf
+                self.env.episode_length_buf = torch.randint_like(
+                    lengths, high=max(int(self.env.max_episode_length), 1)
+                )
+            observations = self.env.get_observations().to(self.device)
+        self._observations = observations
+        return observations
+
+    def _collect(self, observations: TensorDict) -> TensorDict:
+        """Step all environments `num_steps_per_env` times; return the last observations."""
+        check_every_step = self.cfg.get("check_for_nan", True)
+        for _ in range(self.cfg["num_steps_per_env"]):
+            actions = self.alg.act(observations)
+            observations, rewards, dones, extras = self.env.step(actions.to(self.env.device))
+            if check_every_step:
+                check_nan(observations, rewards, dones)
+            observations = observations.to(self.device)
+            rewards, dones = rewards.to(self.device), dones.to(self.device)
+            self.alg.process_env_step(observations, rewards, dones, extras)
+            intrinsic = self.alg.intrinsic_rewards if self._uses_rnd else None
+            self.logger.process_env_step(rewards, dones, extras, intrinsic)
+        return observations
+
+    def _report(
+        self,
+        iteration: int,
+        first: int,
+        total: int,
+        collection_time: float,
+        learning_time: float,
+        losses: dict[str, float],
+    ) -> IterationStats:
+        stats = self.logger.finish_iteration(
+            iteration=iteration,
+            first_iteration=first,
+            total_iterations=total,
+            collection_time=collection_time,
+            learning_time=learning_time,
+            losses=losses,
+            learning_rate=self.alg.learning_rate,
+            action_std=self.alg.get_policy().output_std.detach(),
+            rnd_weight=self.alg.rnd.weight if self.alg.rnd else None,
+        )
+        self._tell("on_iteration", stats)
+        return stats
+
+    def _reason_to_stop(self, stop: StopRequest, stats: IterationStats) -> str:
+        """Return "solved" or "interrupted" if training should end here, else ""."""
+        solved = self._writes and self._is_solved(stats)
+        code = 2 if stop.requested else int(solved)
+        if self.is_distributed:
+            # All processes have to leave the loop at the same iteration.
+            shared = torch.tensor(code, device=self.device)
+            torch.distributed.all_reduce(shared, op=torch.distributed.ReduceOp.MAX)
+            code = int(shared.item())
+        return _REASONS[code]
+
+    def _finish(self, first: int, total: int) -> None:
+        if self.current_learning_iteration == first:
+            if total <= first:
+                logger.warning(
+                    "Nothing to train: the checkpoint has finished %d iterations, and "
+                    "max_iterations, which counts them in, is %d.", first, total,
+                )  # fmt: skip
+            return
+        self._save_checkpoint()
+
+    def _resolve_threads(self) -> int:
+        if torch.device(self.device).type != "cpu":
+            return torch.get_num_threads()
+        parameters = sum(
+            parameter.numel()
+            for group in self.alg.optimizer.param_groups
+            for parameter in group["params"]
+        )
+        rows = self.env.num_envs * self.cfg["num_steps_per_env"]
+        parts = self.cfg["algorithm"].get("num_mini_batches", 1)
+        return torch_threads(parameters, rows // max(int(parts), 1))
+
+    # Evaluation while training.
+
+    def _is_solved(self, stats: IterationStats) -> bool:
+        """Evaluate the policy if it may have solved the task; return whether to stop for it."""
+        if not self._solved_check.is_due(stats):
+            return False
+        self._solved_check.last_iteration = stats.iteration
+        result = self.evaluate()
+        solved = self._solved_check.is_solved_by(result)
+        self._tell("on_evaluation", stats.iteration, result, solved)
+        self.logger.write_evaluation(result, stats.iteration - 1)
+        return solved and self._solved_check.stops_training
+
+    def evaluate(self) -> EvaluationResult:
+        """Score the policy in environments of its own; the run itself is not touched."""
+        self.last_evaluation = self._solved_check.evaluate()
+        return self.last_evaluation
+
+    # Checkpoints.
+
+    def save(self, path: str, infos=None) -> None:
+        """Write a checkpoint from which training resumes exactly; only the first process writes.
+
+        Args:
+            path: Where to; the file appears whole or not at all.
+            infos: Further plain data, which `load` returns.
+
+        Raises:
+            CheckpointError: it could not be written; an earlier file at `path` is intact.
+        """
+        if not self._writes:
+            return
+        observations = self._observations
+        if observations is None:
+            observations = self.env.get_observations()
+        done = self.current_learning_iteration
+        counter = getattr(self.env.unwrapped, "common_step_counter", 0)
+        checkpoint = self.alg.save()
+        # rsl_rl calls the last finished iteration "iter"; it cannot tell none from one.
+        checkpoint["iter"] = max(done - 1, 0)
+        checkpoint["iterations_finished"] = done
+        checkpoint["infos"] = {
+            **(infos or {}),
+            "env_state": {"common_step_counter": int(counter)},
+        }
+        checkpoint["last_evaluated"] = self._solved_check.last_iteration
+        checkpoint["training_state"] = training_state.capture(
+            self.env, self.alg, self.logger, observations
+        )
+        save_checkpoint(checkpoint, path)
+        if self.cfg.get("upload_model", True):
+            self.logger.save_model(path, max(done - 1, 0))
+
+    def load(
+        self,
+        path: str,
+        load_cfg: dict | None = None,
+        strict: bool = True,
+        map_location: str | None = None,
+    ) -> dict:
+        """Load a checkpoint, also one of rsl_rl or of an older layout.
+
+        Args:
+            path: The file.
+            load_cfg: Which parts to load (`actor`, `critic`, `optimizer`, `iteration`, `rnd`);
+                None loads all, and `learn` then resumes the environments and the random number
+                generators too, if there are as many environments.
+            strict: Whether every parameter has to fit.
+            map_location: Without effect: tensors go where the networks are.
+
+        Returns:
+            The `infos` given to `save`.
+
+        Raises:
+            CheckpointError: the file is missing, corrupt, hostile, or of another network.
+        """
+        checkpoint = migrate(load_checkpoint(path))
+        if strict:
+            self._check_networks(checkpoint, load_cfg, str(path))
+        try:
+            with_iteration = self.alg.load(checkpoint, load_cfg, strict)
+        except (KeyError, ValueError, RuntimeError) as error:
+            raise CheckpointError(
+                f"The checkpoint {str(path)!r} does not fit this algorithm: {error}. To use its "
+                "policy only, load it with load_cfg={'actor': True}."
+            ) from error
+        if with_iteration:
+            finished = checkpoint.get("iterations_finished", checkpoint.get("iter", -1) + 1)
+            self.current_learning_iteration = finished
+            self._solved_check.last_iteration = checkpoint.get("last_evaluated", 0)
+        infos = checkpoint.get("infos") or {}
+        counter = (infos.get("env_state") or {}).get("common_step_counter")
+        if counter is not None:
+            self.env.unwrapped.common_step_counter = counter
+        self._state_to_resume = checkpoint.get("training_state") if load_cfg is None else None
+        self._observations = None
+        return infos
+
+    def _check_networks(
+        self, checkpoint: Mapping[str, Any], load_cfg: dict | None, path: str
+    ) -> None:
+        for name in ("actor", "critic"):
+            model = getattr(self.alg, f"_raw_{name}", None)
+            if model is not None and (load_cfg is None or load_cfg.get(name)):
+                check_fits(model, checkpoint.get(f"{name}_state_dict"), name=name, path=path)
+
+    def _resumed_observations(self) -> TensorDict | None:
+        state, self._state_to_resume = self._state_to_resume, None
+        if self._observations is not None:
+            # `learn` was called before in this process: the environments are where they were.
+            return self._observations
+        if self.current_learning_iteration == 0 and state is None:
+            return None
+        if state is None or self.is_distributed:
+            why = "several processes share the run" if state else "the checkpoint has none"
+            logger.warning("Episodes and random numbers start anew: %s.", why)
+            return None
+        try:
+            return training_state.restore(state, self.env, self.alg, self.logger)
+        except ValueError as error:
+            logger.warning(
+                "Weights, optimizer and iteration are resumed, but episodes and random numbers "
+                "start anew, because the saved state does not fit. %s", error,
+            )  # fmt: skip
+            return None
+
+    def _save_checkpoint(self) -> None:
+        """Write a checkpoint into the run folder, and the policy as ONNX beside it."""
+        if not self._writes or self.logger.log_dir is None:
+            return
+        name = f"model_{self.current_learning_iteration - 1}.pt"
+        path = os.path.join(self.logger.log_dir, name)
+        self.save(path)
+        self.export_policy()
+        self._tell("on_checkpoint", path)
+
+    # Export.
+
+    def export_policy_to_onnx(
+        self, path: str, filename: str = "policy.onnx", verbose: bool = False
+    ) -> None:
+        """Write the policy (normalizer, network, deterministic head) to `path`/`filename`.
+
+        Opset 18, batch size 1; input `obs`, output `actions` (recurrent and image models have
+        more inputs).
+        """
+        model = self.alg.get_policy().as_onnx(verbose=verbose)
+        export_to_onnx(model, Path(path) / filename, verbose)
+
+    def export_policy(self, path: str | None = None) -> str | None:
+        """Write the policy as ONNX with all that a deployment needs to know.
+
+        Args:
+            path: The file; None: `<run folder>/<run folder's name>.onnx`.
+
+        Returns:
+            The file, or None if there is no run folder or the export failed. Failures are logged:
+            a run is not lost because its policy has no ONNX form.
+        """
+        if path is None:
+            if not self._writes or self.logger.log_dir is None:
+                return None
+            folder = Path(self.logger.log_dir)
+            path = str(folder / f"{folder.resolve().name}.onnx")
+        target = Path(path)
+        try:
+            self.export_policy_to_onnx(str(target.parent), target.name)
+        except Exception as error:
+            logger.warning("The policy was not exported to %s: %s", path, error)
+            return None
+        try:
+            attach_metadata_to_onnx(path, self.onnx_metadata())
+        except Exception as error:
+            logger.warning("The exported policy %s is without metadata: %s", path, error)
+        if self.cfg.get("upload_model", True):
+            self.logger.save_model(path, max(self.current_learning_iteration - 1, 0))
+        return path
+
+    def onnx_metadata(self) -> dict[str, Any]:
+        """Return the metadata that `export_policy` writes; task runners add to it."""
+        folder = self.logger.log_dir
+        run = Path(folder).resolve().name if folder is not None else "local"
+        return dict(get_base_metadata(self.env.unwrapped, run))
+
+    # Helpers.
+
+    @property
+    def _writes(self) -> bool:
+        """Whether this process writes files: the first one does."""
+        return self.gpu_global_rank == 0
+
+    @property
+    def _uses_rnd(self) -> bool:
+        return bool(self.cfg["algorithm"].get("rnd_cfg"))
+
+    def _tell(self, event: str, *args: Any) -> None:
+        for observer in self.observers:
+            getattr(observer, event)(*args)
+
+
+def _drop_unused_keys(train_cfg: dict) -> None:
+    """Remove settings of models that rsl_rl's constructors take only where they are used."""
+    for name in ("actor", "critic", "student", "teacher"):
+        model = train_cfg.get(name)
+        if not isinstance(model, dict):
+            continue
+        for key in ("cnn_cfg", "distribution_cfg"):
+            if model.get(key, ...) is None:
+                del model[key]
+        if model.get("rnn_type", ...) is None:
+            for key in _RECURRENT_KEYS:
+                model.pop(key, None)
+
+
+@contextlib.contextmanager
+def _printing_to_log() -> Iterator[None]:
+    """Send what rsl_rl prints (networks, observation sets) to the log, at level DEBUG."""
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        yield
+    logger.debug("%s", printed.getvalue().rstrip())

@@ -1,0 +1,136 @@
+"""Image encoders that tell where features are instead of how strong they are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import nn
+
+from mjlab.rl.rsl import CNN, CNNModel, TensorDict
+
+# Keys of a CNN config that are not for rsl_rl's CNN.
+_OWN_KEYS = ("spatial_softmax", "spatial_softmax_temperature")
+
+
+class SpatialSoftmax(nn.Module):
+    """The expected position of each channel's activation.
+
+    With w = softmax(x / temperature) over the cells of a channel, the output is (sum w * row,
+    sum w * column), rows and columns running from -1 to 1 (a side of length 1 is at -1).
+    """
+
+    rows: torch.Tensor
+    columns: torch.Tensor
+
+    def __init__(self, height: int, width: int, temperature: float = 1.0) -> None:
+        """Take feature maps of `height` x `width` cells."""
+        super().__init__()
+        self.temperature = temperature
+        rows, columns = torch.meshgrid(
+            torch.linspace(-1.0, 1.0, height), torch.linspace(-1.0, 1.0, width), indexing="ij"
+        )
+        self.register_buffer("rows", rows.reshape(-1))
+        self.register_buffer("columns", columns.reshape(-1))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Map features (B, C, H, W) to (B, 2 C): row and column of channel 0, of channel 1, ..."""
+        weights = torch.softmax(x.flatten(2) / self.temperature, dim=-1)
+        row = (weights * self.rows).sum(-1)
+        column = (weights * self.columns).sum(-1)
+        return torch.stack((row, column), dim=-1).flatten(1)
+
+
+class SpatialSoftmaxCNN(nn.Module):
+    """rsl_rl's CNN, without pooling and flattening at its end, and a spatial softmax."""
+
+    def __init__(
+        self,
+        input_dim: tuple[int, int],
+        input_channels: int,
+        temperature: float = 1.0,
+        **cnn_kwargs: Any,
+    ) -> None:
+        """Take images of `input_dim` (height, width); `cnn_kwargs` are those of rsl_rl's CNN."""
+        super().__init__()
+        cnn_kwargs = {**cnn_kwargs, "global_pool": "none", "flatten": False}
+        cnn: Any = CNN(input_dim=input_dim, input_channels=input_channels, **cnn_kwargs)
+        height, width = cnn.output_dim
+        self.cnn = cnn
+        self.spatial_softmax = SpatialSoftmax(height, width, temperature)
+        self._output_dim = 2 * int(cnn.output_channels)
+
+    @property
+    def output_channels(self) -> None:
+        """None: the output is flat, as rsl_rl's models ask."""
+        return None
+
+    @property
+    def output_dim(self) -> int:
+        """Two numbers for each channel."""
+        return self._output_dim
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Map images (B, C, H, W) to (B, output_dim)."""
+        return self.spatial_softmax(self.cnn(x))
+
+
+class SpatialSoftmaxCNNModel(CNNModel):
+    """rsl_rl's model for images and plain observations, with spatial softmax encoders."""
+
+    def __init__(
+        self,
+        obs: TensorDict,
+        obs_groups: dict[str, list[str]],
+        obs_set: str,
+        output_dim: int,
+        cnn_cfg: dict[str, dict] | dict[str, Any],
+        cnns: nn.ModuleDict | None = None,
+        hidden_dims: tuple[int] | list[int] = [256, 256, 256],  # noqa: B006
+        activation: str = "elu",
+        obs_normalization: bool = False,
+        distribution_cfg: dict[str, Any] | None = None,
+    ) -> None:
+        """Take rsl_rl's arguments.
+
+        `cnn_cfg` is one config for all image groups, or one for each by name; besides what
+        rsl_rl's CNN takes, it may have `spatial_softmax_temperature`. `cnns` are encoders to share.
+
+        Raises:
+            ValueError: `cnns`, or the names in `cnn_cfg`, are not those of the image groups.
+        """
+        if cnns is None:
+            self._get_obs_dim(obs, obs_groups, obs_set)
+            encoders = self._make_encoders(cnn_cfg)
+        else:
+            encoders = cnns
+        super().__init__(
+            obs,
+            obs_groups,
+            obs_set,
+            output_dim,
+            hidden_dims=hidden_dims,
+            activation=activation,
+            obs_normalization=obs_normalization,
+            distribution_cfg=distribution_cfg,
+            cnns=encoders,
+        )
+
+    def _make_encoders(self, cnn_cfg: dict[str, Any]) -> dict[str, nn.Module]:
+        groups = list(self.obs_groups_2d)
+        if not all(isinstance(value, dict) for value in cnn_cfg.values()):
+            cnn_cfg = dict.fromkeys(groups, cnn_cfg)
+        if set(cnn_cfg) != set(groups):
+            raise ValueError(
+                f"cnn_cfg has configs for {sorted(cnn_cfg)}, and the image groups are "
+                f"{sorted(groups)}; give one for each, or one for all."
+            )
+        return {
+            group: SpatialSoftmaxCNN(
+                input_dim=self.obs_dims_2d[index],
+                input_channels=self.obs_channels_2d[index],
+                temperature=cnn_cfg[group].get("spatial_softmax_temperature", 1.0),
+                **{k: v for k, v in cnn_cfg[group].items() if k not in _OWN_KEYS},
+            )
+            for index, group in enumerate(groups)
+        }

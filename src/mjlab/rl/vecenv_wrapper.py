@@ -1,0 +1,144 @@
+"""The environment as rsl_rl wants to see it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from mjlab.rl.rsl import TensorDict, VecEnv
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.envs.manager_based_rl_env import ManagerBasedRlEnvCfg
+    from mjlab.utils.spaces import Space
+
+
+class RslRlVecEnvWrapper(VecEnv):
+    """Adapts a `ManagerBasedRlEnv` (possibly wrapped) to rsl_rl's `VecEnv`.
+
+    Observations become a TensorDict of groups with batch size [num_envs]; `terminated` and
+    `truncated` become one `dones`. Episodes that only ran out of time are marked in
+    `extras["time_outs"]`, so that the algorithm adds the value of what would have followed, unless
+    the task says that its horizon is finite.
+    """
+
+    def __init__(self, env: ManagerBasedRlEnv, clip_actions: float | None = None):
+        """Wrap `env` and reset it once.
+
+        Args:
+            env: The environment.
+            clip_actions: Actions are clamped to plus and minus this before `env` sees them.
+
+        Raises:
+            ValueError: `clip_actions` is not positive.
+        """
+        if clip_actions is not None and not clip_actions > 0:
+            raise ValueError(f"clip_actions is {clip_actions}; give a positive number or None.")
+        self.env = env
+        self.clip_actions = clip_actions
+        self.num_envs = self.unwrapped.num_envs
+        self.device = torch.device(self.unwrapped.device)
+        self.max_episode_length = self.unwrapped.max_episode_length
+        self.num_actions = self.unwrapped.action_manager.total_action_dim
+        self._limit_action_spaces()
+        self.env.reset()
+
+    def __str__(self) -> str:
+        return f"<{type(self).__name__}{self.env}>"
+
+    __repr__ = __str__
+
+    @classmethod
+    def class_name(cls) -> str:
+        """Name of this class."""
+        return cls.__name__
+
+    @property
+    def cfg(self) -> ManagerBasedRlEnvCfg:  # ty: ignore[incompatible-property-override]
+        """Config of the environment."""
+        return self.unwrapped.cfg
+
+    @property
+    def render_mode(self) -> str | None:
+        """Render mode of the environment."""
+        return self.env.render_mode
+
+    @property
+    def observation_space(self) -> Space:
+        """Space of all environments' observations."""
+        return self.env.observation_space
+
+    @property
+    def action_space(self) -> Space:
+        """Space of all environments' actions."""
+        return self.env.action_space
+
+    @property
+    def unwrapped(self) -> ManagerBasedRlEnv:
+        """The environment below all wrappers."""
+        return self.env.unwrapped
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Steps since the last reset, shape (num_envs,), int64.
+
+        Assigning copies into the environment's own tensor, so that references to it stay valid.
+        """
+        return self.unwrapped.episode_length_buf
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: torch.Tensor) -> None:
+        self.unwrapped.episode_length_buf.copy_(value)
+
+    def seed(self, seed: int = -1) -> int:
+        """Seed every random number generator; -1 draws a seed. Returns the seed used."""
+        return self.unwrapped.seed(seed)
+
+    def reset(self) -> tuple[TensorDict, dict]:
+        """Start new episodes in all environments."""
+        observations, extras = self.env.reset()
+        return self._as_tensordict(observations), extras
+
+    def get_observations(self) -> TensorDict:
+        """Return the observations of the last step or reset."""
+        return self._as_tensordict(self.unwrapped.get_observations())
+
+    def step(
+        self, actions: torch.Tensor
+    ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Step all environments.
+
+        Args:
+            actions: Shape (num_envs, num_actions).
+
+        Returns:
+            Observations; rewards (num_envs,); dones (num_envs,) int64; extras.
+        """
+        if self.clip_actions is not None:
+            actions = torch.clamp(actions, -self.clip_actions, self.clip_actions)
+        observations, rewards, terminated, truncated, extras = self.env.step(actions)
+        dones = (terminated | truncated).to(dtype=torch.long)
+        if not self.cfg.is_finite_horizon:
+            # An episode that ended in a terminal state has no future to bootstrap from, even when
+            # it ran out of time in the same step.
+            extras["time_outs"] = truncated & ~terminated
+        return self._as_tensordict(observations), rewards, dones, extras
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+
+    def _as_tensordict(self, observations: dict[str, Any]) -> TensorDict:
+        return TensorDict(observations, batch_size=[self.num_envs])
+
+    def _limit_action_spaces(self) -> None:
+        if self.clip_actions is None:
+            return
+        from mjlab.utils.spaces import batch_space
+
+        limits = {"low": -self.clip_actions, "high": self.clip_actions}
+        env = self.unwrapped
+        env.single_action_space = dataclasses.replace(env.single_action_space, **limits)
+        env.action_space = batch_space(env.single_action_space, self.num_envs)

@@ -1,0 +1,239 @@
+"""Checkpoint files: whole or not at all, data only, and what is said when one is unusable."""
+
+from __future__ import annotations
+
+import errno
+import os
+import pickle
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mjlab.rl import checkpoint
+from mjlab.rl.checkpoint import (
+    CheckpointError,
+    RunFolderError,
+    ensure_writable_folder,
+    load_checkpoint,
+    save_checkpoint,
+)
+from mjlab.rl.migration import migrate
+from mjlab.rl.rng import preserved_rng, rng_state, set_rng_state
+
+
+def test_data_comes_back_as_saved(tmp_path: Path):
+    data = {"a": torch.arange(3), "b": {"c": [1, 2.5, "x", None, (True,)]}}
+    save_checkpoint(data, tmp_path / "new" / "model_0.pt")
+    loaded = load_checkpoint(tmp_path / "new" / "model_0.pt")
+    assert torch.equal(loaded.pop("a"), data.pop("a"))
+    assert loaded == data
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["model_0.pt"]
+
+
+@pytest.mark.parametrize("failing", ["write", "fsync", "replace"])
+def test_a_failing_save_leaves_the_previous_file_and_nothing_else(
+    tmp_path: Path, monkeypatch, failing
+):
+    path = tmp_path / "model_3.pt"
+    save_checkpoint({"a": 1}, path)
+
+    def fail(*args, **kwargs):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    if failing == "write":
+        monkeypatch.setattr(checkpoint, "_write", fail)
+    else:
+        monkeypatch.setattr(os, failing, fail)
+    with pytest.raises(CheckpointError, match="disk is full") as caught:
+        save_checkpoint({"a": 2}, path)
+    assert "model_3.pt', is intact" in str(caught.value)
+    assert "--agent.resume True" in str(caught.value)
+    monkeypatch.undo()
+    assert load_checkpoint(path) == {"a": 1}
+    assert [entry.name for entry in tmp_path.iterdir()] == ["model_3.pt"]
+
+
+def test_the_file_is_on_the_disk_before_it_takes_its_name(tmp_path: Path, monkeypatch):
+    calls = []
+    for name in ("fsync", "replace"):
+        original = getattr(os, name)
+
+        def record(*args, _name=name, _original=original):
+            calls.append(_name)
+            return _original(*args)
+
+        monkeypatch.setattr(os, name, record)
+    save_checkpoint({"a": 1}, tmp_path / "model_0.pt")
+    assert calls == ["fsync", "replace", "fsync"]
+
+
+def test_a_missing_checkpoint_names_those_there_are(tmp_path: Path):
+    save_checkpoint({}, tmp_path / "model_7.pt")
+    with pytest.raises(CheckpointError, match=r"model_8.pt'. .*\['model_7.pt'\]"):
+        load_checkpoint(tmp_path / "model_8.pt")
+    with pytest.raises(CheckpointError, match="its folder does not exist"):
+        load_checkpoint(tmp_path / "nowhere" / "model_8.pt")
+    with pytest.raises(CheckpointError, match="is a folder"):
+        load_checkpoint(tmp_path)
+
+
+@pytest.mark.parametrize("keep", [0, 1, 10, 200, 700])
+def test_a_truncated_checkpoint_is_called_so(tmp_path: Path, keep):
+    path = tmp_path / "model_0.pt"
+    save_checkpoint({"a": torch.zeros(100)}, path)
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(CheckpointError, match="corrupt|not a file of torch"):
+        load_checkpoint(path)
+
+
+@pytest.mark.parametrize("content", [b"hello, world", b"PK\x03\x04 no zip", b"\x80\x04."])
+def test_a_file_that_is_no_checkpoint_is_called_so(tmp_path: Path, content):
+    path = tmp_path / "model_0.pt"
+    path.write_bytes(content)
+    with pytest.raises(CheckpointError, match="model_0.pt"):
+        load_checkpoint(path)
+
+
+class Hostile:
+    def __init__(self, target: Path) -> None:
+        self.target = target
+
+    def __reduce__(self):
+        return (os.system, (f"touch {self.target}",))
+
+
+@pytest.mark.parametrize("writer", ["torch", "pickle 2", "pickle 4"])
+def test_a_pickle_that_runs_code_is_refused_and_not_run(tmp_path: Path, writer):
+    path, target = tmp_path / "model_0.pt", tmp_path / "was_here"
+    payload = {"actor_state_dict": Hostile(target)}
+    if writer == "torch":
+        torch.save(payload, path)
+    else:
+        path.write_bytes(pickle.dumps(payload, protocol=int(writer[-1])))
+    # Today's protocol is not read at all, so it is not known what it would call.
+    reason = "it is not a file of torch" if writer == "pickle 4" else "it wants to call '.*system'"
+    with pytest.raises(CheckpointError, match=f"was refused: {reason}.*Nothing in it was run"):
+        load_checkpoint(path)
+    assert not target.exists()
+
+
+def test_another_object_than_a_dict_is_refused(tmp_path: Path):
+    torch.save([1, 2], tmp_path / "model_0.pt")
+    with pytest.raises(CheckpointError, match="holds a list"):
+        load_checkpoint(tmp_path / "model_0.pt")
+
+
+def test_another_network_is_refused_with_all_shapes(make_runner, tmp_path: Path):
+    from rl_fake_env import runner_cfg
+
+    make_runner(tmp_path / "run").learn(1)
+    actor = runner_cfg()["actor"] | {"hidden_dims": (9,)}
+    other = make_runner(actor=actor)
+    before = [parameter.clone() for parameter in other.alg.actor.parameters()]
+    with pytest.raises(CheckpointError) as caught:
+        other.load(str(tmp_path / "run" / "model_0.pt"))
+    assert "mlp.0.weight: expected (9, 2), found (8, 2)" in str(caught.value)
+    assert "mlp.2.weight: expected (2, 9), found (2, 8)" in str(caught.value)
+    for one, kept in zip(other.alg.actor.parameters(), before, strict=True):
+        assert torch.equal(one, kept)
+
+
+def test_a_checkpoint_without_a_critic_or_optimizer_is_refused_by_name(make_runner, tmp_path):
+    runner = make_runner()
+    runner.save(str(tmp_path / "model_0.pt"))
+    whole = load_checkpoint(tmp_path / "model_0.pt")
+    for part in ("critic_state_dict", "optimizer_state_dict"):
+        partial = {key: value for key, value in whole.items() if key != part}
+        save_checkpoint(partial, tmp_path / "partial.pt")
+        with pytest.raises(CheckpointError, match=part.split("_")[0]):
+            runner.load(str(tmp_path / "partial.pt"))
+        runner.load(str(tmp_path / "partial.pt"), load_cfg={"actor": True})
+
+
+def test_a_checkpoint_of_rsl_rl_continues_at_the_next_iteration(make_runner, tmp_path: Path):
+    runner = make_runner()
+    infos = {"mine": 3, "env_state": {"common_step_counter": 17}}
+    torch.save({**runner.alg.save(), "iter": 4, "infos": infos}, tmp_path / "model_4.pt")
+    assert runner.load(str(tmp_path / "model_4.pt"))["mine"] == 3
+    assert runner.current_learning_iteration == 5
+    assert runner.env.unwrapped.common_step_counter == 17
+    torch.save({**runner.alg.save(), "iter": 4, "infos": None}, tmp_path / "model_4.pt")
+    assert runner.load(str(tmp_path / "model_4.pt")) == {}
+
+
+def test_infos_come_back_with_the_step_counter(make_runner, tmp_path: Path):
+    runner = make_runner()
+    runner.env.unwrapped.common_step_counter = 5
+    runner.save(str(tmp_path / "model_0.pt"), infos={"note": "mine"})
+    other = make_runner()
+    infos = other.load(str(tmp_path / "model_0.pt"))
+    assert infos == {"note": "mine", "env_state": {"common_step_counter": 5}}
+    assert other.env.unwrapped.common_step_counter == 5
+
+
+def test_the_old_single_model_layout_is_split(make_runner, tmp_path: Path):
+    runner = make_runner()
+    today = runner.alg.save()
+    old = {"critic_obs_normalizer.count": today["critic_state_dict"]["obs_normalizer.count"]}
+    for part in ("actor", "critic"):
+        for name, value in today[f"{part}_state_dict"].items():
+            renamed = name.replace("mlp.", f"{part}.").replace(
+                "obs_normalizer.", f"{part}_obs_normalizer."
+            )
+            old["std" if name == "distribution.std_param" else renamed] = value + 1
+    old["unknown.weight"] = torch.zeros(1)
+    file = {
+        "model_state_dict": old,
+        "optimizer_state_dict": today["optimizer_state_dict"],
+        "iter": 9,
+        "infos": None,
+    }
+    torch.save(file, tmp_path / "model_9.pt")
+    runner.load(str(tmp_path / "model_9.pt"))
+    for part in ("actor", "critic"):
+        loaded = runner.alg.save()[f"{part}_state_dict"]
+        for name, value in today[f"{part}_state_dict"].items():
+            # `today` shares memory with the networks, so it shows what was loaded.
+            assert torch.equal(loaded[name], value)
+    assert (runner.alg.actor.distribution.std_param == 2.0).all()
+
+
+@pytest.mark.parametrize(("old", "new"), [("std", "std_param"), ("log_std", "log_std_param")])
+def test_the_old_names_of_the_standard_deviation_are_known(old, new):
+    value = torch.ones(2)
+    file = {"actor_state_dict": {"mlp.0.weight": value, old: value}, "iter": 1}
+    migrated = migrate(file)
+    assert set(migrated["actor_state_dict"]) == {"mlp.0.weight", f"distribution.{new}"}
+    assert old in file["actor_state_dict"]
+
+
+def draws() -> tuple:
+    return (torch.rand(2).tolist(), np.random.rand(), np.random.randn(), random.gauss(0, 1))
+
+
+def test_generators_go_on_from_a_saved_state(tmp_path: Path):
+    # An odd number of Gaussian draws leaves half a pair waiting in NumPy and in Python.
+    np.random.randn()
+    random.gauss(0, 1)
+    save_checkpoint(rng_state(), tmp_path / "rng.pt")
+    expected = [draws(), draws()]
+    set_rng_state(load_checkpoint(tmp_path / "rng.pt"))
+    assert [draws(), draws()] == expected
+
+
+def test_preserved_rng_puts_generators_back():
+    state = rng_state()
+    with preserved_rng():
+        inside = draws()
+    assert draws() == inside
+    set_rng_state(state)
+
+
+def test_an_unwritable_folder_is_named(tmp_path: Path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunFolderError, match="file/run.*--log-root"):
+        ensure_writable_folder(tmp_path / "file" / "run")
+    assert list(ensure_writable_folder(tmp_path / "new" / "run").iterdir()) == []

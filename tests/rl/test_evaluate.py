@@ -1,0 +1,145 @@
+"""Scoring a policy."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+from rl_fake_env import FakeEnv, FakeEnvCfg, FakeSceneCfg
+
+from mjlab.rl import RslRlVecEnvWrapper
+from mjlab.rl.evaluate import evaluate_policy, make_evaluation_env, wilson_interval
+
+
+class CountingEnv(FakeEnv):
+    """Environment i ends its k-th episode after i + k steps; a step's reward is its number."""
+
+    def reset(self):
+        self.episode = torch.ones(self.num_envs, dtype=torch.long)
+        self.episode_length_buf[:] = 0
+        return self.get_observations(), {}
+
+    def step(self, action):
+        self.episode_length_buf += 1
+        reward = self.episode_length_buf * self.step_dt
+        done = self.episode_length_buf >= torch.arange(self.num_envs) + self.episode
+        self.episode += done
+        self.episode_length_buf[done] = 0
+        return self.get_observations(), reward, done, torch.zeros_like(done), {"log": {}}
+
+
+def counting(num_envs: int = 4, **cfg) -> RslRlVecEnvWrapper:
+    scene = FakeSceneCfg(num_envs=num_envs)
+    return RslRlVecEnvWrapper(CountingEnv(FakeEnvCfg(scene=scene, episode_steps=20, **cfg)))
+
+
+def still(observations) -> torch.Tensor:
+    return torch.zeros(observations["actor"].shape[0], 2)
+
+
+def test_each_environment_is_scored_on_its_first_episode_only():
+    result = evaluate_policy(counting(), still)
+    # First episodes have 1, 2, 3, 4 steps, with returns 1, 1+2, 1+2+3, 1+2+3+4; the shorter ones
+    # are followed by others that must not count.
+    assert result.returns == (1.0, 3.0, 6.0, 10.0)
+    assert result.num_episodes == 4
+    assert result.mean_return == 5.0
+    assert result.mean_length == 2.5
+    assert (result.min_return, result.max_return) == (1.0, 10.0)
+    half = 1.959964 * result.std_return / math.sqrt(4)
+    assert result.return_interval == pytest.approx((5.0 - half, 5.0 + half))
+    assert result.success_rate is None
+    assert result.num_unfinished == 0
+
+
+def test_returns_are_before_scaling_by_the_step():
+    scaled, plain = counting(), counting(scale_rewards_by_dt=False)
+    assert evaluate_policy(scaled, still).mean_return == 5.0
+    assert evaluate_policy(plain, still).mean_return == 2.5
+
+
+def test_more_episodes_than_environments_take_rounds_and_fewer_take_part_of_one():
+    assert evaluate_policy(counting(), still, 6).returns == (1.0, 3.0, 6.0, 10.0, 1.0, 3.0)
+    assert evaluate_policy(counting(), still, 2).returns == (1.0, 3.0)
+
+
+def test_episodes_are_cut_off_and_counted_as_unfinished():
+    result = evaluate_policy(counting(), still, max_steps=3)
+    assert result.returns == (1.0, 3.0, 6.0, 6.0)
+    assert result.num_unfinished == 1
+
+
+def test_success_is_by_return_or_by_function():
+    result = evaluate_policy(counting(), still, success_return=6.0)
+    assert result.success_rate == 0.5
+    assert result.success_interval == wilson_interval(0.5, 4)
+    # The function is asked before each step, so the last answer is that of the terminal state's
+    # predecessor: environment i has made i steps then.
+    by_function = evaluate_policy(
+        counting(), still, success_func=lambda env: env.episode_length_buf >= 3
+    )
+    assert by_function.success_rate == 0.25
+
+
+def test_json_has_the_figures_without_the_single_returns():
+    figures = json.loads(evaluate_policy(counting(), still, success_return=6.0).to_json())
+    assert figures["mean_return"] == 5.0
+    assert figures["success_rate"] == 0.5
+    assert len(figures["return_interval"]) == 2
+    assert "returns" not in figures
+
+
+def test_the_same_seed_gives_the_same_figures():
+    env = RslRlVecEnvWrapper(FakeEnv(FakeEnvCfg(seed=None)))
+    one = evaluate_policy(env, still, seed=3)
+    assert evaluate_policy(env, still, seed=3).returns == one.returns
+    assert evaluate_policy(env, still, seed=4).returns != one.returns
+
+
+def test_a_policy_with_memory_is_reset_with_its_environments():
+    class Memory:
+        def __init__(self):
+            self.calls = []
+
+        def __call__(self, observations):
+            return still(observations)
+
+        def reset(self, dones=None):
+            self.calls.append(None if dones is None else dones.tolist())
+
+    policy = Memory()
+    evaluate_policy(counting(2), policy)
+    assert policy.calls[:3] == [None, [1, 0], [0, 1]]
+
+
+def test_endless_episodes_and_no_episodes_are_refused():
+    endless = RslRlVecEnvWrapper(FakeEnv(FakeEnvCfg(episode_steps=10**9)))
+    with pytest.raises(ValueError, match="episode_length_s, or give max_steps"):
+        evaluate_policy(endless, still)
+    with pytest.raises(ValueError, match="num_episodes is 0"):
+        evaluate_policy(counting(), still, 0)
+    with pytest.raises(ValueError, match="max_steps is 0"):
+        evaluate_policy(counting(), still, max_steps=0)
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.25, 1.0])
+def test_the_interval_of_a_rate_is_within_bounds_and_shrinks(rate):
+    few, many = wilson_interval(rate, 10), wilson_interval(rate, 1000)
+    for low, high in (few, many):
+        assert 0.0 <= low <= rate <= high <= 1.0
+        assert low < high
+    assert many[1] - many[0] < few[1] - few[0]
+
+
+def test_an_environment_beside_another_leaves_it_and_the_generators_alone():
+    env = RslRlVecEnvWrapper(FakeEnv(FakeEnvCfg()))
+    generators, position = torch.get_rng_state(), env.unwrapped.position.clone()
+    beside = make_evaluation_env(env, 5, seed=9)
+    assert beside.num_envs == 5
+    assert beside.cfg.seed == 9
+    assert env.num_envs == 8
+    assert env.cfg.seed == 0
+    assert torch.equal(torch.get_rng_state(), generators)
+    assert torch.equal(env.unwrapped.position, position)

@@ -1,0 +1,59 @@
+"""Learning curves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjlab.rl.plot import DEFAULT_TAG, mean_and_std, plot_run, plot_seeds, read_scalars
+
+
+def write_run(folder: Path, values: dict[int, float], tag: str = DEFAULT_TAG) -> Path:
+    from torch.utils.tensorboard import SummaryWriter
+
+    writer = SummaryWriter(str(folder))
+    for iteration, value in values.items():
+        writer.add_scalar(tag, value, iteration)
+    writer.close()
+    return folder
+
+
+def is_png(path: Path) -> bool:
+    return path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_all_values_of_a_long_run_are_read(tmp_path: Path):
+    run = write_run(tmp_path, {i: i / 2 for i in range(1500)})
+    iterations, values = read_scalars(run, DEFAULT_TAG)
+    assert iterations.tolist() == list(range(1500))
+    assert np.array_equal(values, iterations / 2)
+
+
+def test_mean_and_deviation_are_over_all_runs_at_every_iteration():
+    one = (np.array([0, 2, 4]), np.array([0.0, 2.0, 4.0]))
+    # This run was solved after iteration 2, so it stays at its last value.
+    other = (np.array([0, 1, 2]), np.array([0.0, 3.0, 4.0]))
+    iterations, mean, std = mean_and_std([one, other])
+    assert iterations.tolist() == [0, 1, 2, 4]
+    assert mean.tolist() == [0.0, 2.0, 3.0, 4.0]
+    assert std.tolist() == [0.0, 1.0, 1.0, 0.0]
+
+
+def test_one_run_and_several_seeds_become_pngs(tmp_path: Path):
+    runs = [write_run(tmp_path / str(k), {i: i * k for i in range(4)}) for k in (1, 2)]
+    assert is_png(plot_run(runs[0]))
+    assert (runs[0] / "learning_curve.png").is_file()
+    assert is_png(plot_seeds(runs, tmp_path / "new" / "seeds.png", title="Swing-up"))
+    assert is_png(plot_seeds({"a": runs, "b": runs[:1]}, tmp_path / "two.png"))
+
+
+def test_wrong_folders_tags_and_empty_lists_are_named(tmp_path: Path):
+    with pytest.raises(ValueError, match="no TensorBoard event files in '.*empty'"):
+        plot_run(tmp_path / "empty")
+    run = write_run(tmp_path / "run", {0: 1.0})
+    with pytest.raises(ValueError, match=f"no figure 'Train/nothing'. Figures: .*{DEFAULT_TAG}"):
+        plot_run(run, tag="Train/nothing")
+    with pytest.raises(ValueError, match="at least one"):
+        plot_seeds([], tmp_path / "none.png")

@@ -1,0 +1,353 @@
+"""The training loop: exact resume, signals, stopping when solved, what is told and written."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import types
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+import torch
+
+from mjlab.rl.checkpoint import CheckpointError, RunFolderError, load_checkpoint
+from mjlab.rl.config import EvaluationCfg
+from mjlab.rl.progress import IterationStats, TrainingObserver
+
+
+class Recorder(TrainingObserver):
+    def __init__(self) -> None:
+        self.stats: list[IterationStats] = []
+        self.events: list[tuple] = []
+
+    def on_start(self, first_iteration, total_iterations):
+        self.events.append(("start", first_iteration, total_iterations))
+
+    def on_iteration(self, stats):
+        self.stats.append(stats)
+
+    def on_evaluation(self, iteration, result, solved):
+        self.events.append(("evaluation", iteration, solved))
+
+    def on_stop_requested(self, signal_name):
+        self.events.append(("stop", signal_name))
+
+    def on_end(self, reason):
+        self.events.append(("end", reason))
+
+
+def everything(runner) -> dict[str, torch.Tensor]:
+    """Return all that decides how training goes on, by name."""
+    state = {"learning_rate": torch.tensor(runner.alg.learning_rate, dtype=torch.float64)}
+    for part, values in runner.alg.save().items():
+        if part != "optimizer_state_dict":
+            state |= {f"{part}.{name}": value for name, value in values.items()}
+            continue
+        for index, entry in values["state"].items():
+            state |= {f"{part}.{index}.{name}": value for name, value in entry.items()}
+    env = runner.env.unwrapped
+    state |= {"position": env.position, "lengths": env.episode_length_buf}
+    state["next_random"] = torch.rand(3)
+    return state
+
+
+def assert_same_bits(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> None:
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        assert torch.equal(value, other[name]), name
+
+
+def test_a_resumed_run_continues_bit_for_bit(make_runner, tmp_path: Path):
+    straight = make_runner(tmp_path / "straight")
+    straight.learn(6, init_at_random_ep_len=True)
+    expected = everything(straight)
+
+    make_runner(tmp_path / "first").learn(3, init_at_random_ep_len=True)
+    # Another seed, and draws in between: nothing of the second process may matter.
+    second = make_runner(tmp_path / "second", env_cfg={"seed": 77})
+    torch.rand(5)
+    second.load(str(tmp_path / "first" / "model_2.pt"))
+    second.learn(6, init_at_random_ep_len=True)
+
+    assert second.current_learning_iteration == 6
+    assert_same_bits(everything(second), expected)
+
+
+def test_a_killed_run_resumes_from_its_last_checkpoint_bit_for_bit(make_runner, tmp_path: Path):
+    straight = make_runner(tmp_path / "straight")
+    straight.learn(6)
+    expected = everything(straight)
+
+    class Killed(BaseException):
+        pass
+
+    class Kill(TrainingObserver):
+        def on_iteration(self, stats):
+            if stats.iteration == 5:
+                raise Killed
+
+    killed = make_runner(tmp_path / "killed")
+    killed.observers.append(Kill())
+    with pytest.raises(Killed):
+        killed.learn(6)
+    assert sorted(path.name for path in (tmp_path / "killed").glob("model_*")) == [
+        "model_0.pt",
+        "model_2.pt",
+    ]
+    resumed = make_runner(tmp_path / "resumed")
+    resumed.load(str(tmp_path / "killed" / "model_2.pt"))
+    resumed.learn(6)
+    assert_same_bits(everything(resumed), expected)
+
+
+def test_learning_on_in_the_same_process_is_the_same_as_learning_at_once(make_runner):
+    straight, in_parts = make_runner(), None
+    straight.learn(4)
+    expected = everything(straight)
+    in_parts = make_runner()
+    in_parts.learn(2)
+    in_parts.learn(4)
+    assert_same_bits(everything(in_parts), expected)
+
+
+def test_observations_and_statistics_of_a_resumed_run_go_on(make_runner, tmp_path: Path):
+    straight, recorder = make_runner(tmp_path / "straight"), Recorder()
+    straight.observers.append(recorder)
+    straight.learn(5)
+    make_runner(tmp_path / "first").learn(3)
+    resumed, again = make_runner(tmp_path / "second"), Recorder()
+    resumed.observers.append(again)
+    resumed.load(str(tmp_path / "first" / "model_2.pt"))
+    resumed.learn(5)
+    assert again.events[0] == ("start", 3, 5)
+    for one, other in zip(recorder.stats[3:], again.stats, strict=True):
+        for name in ("iteration", "total_steps", "mean_reward", "mean_episode_length", "losses"):
+            assert getattr(one, name) == getattr(other, name), name
+
+
+def test_with_another_number_of_environments_only_the_episodes_start_anew(
+    make_runner, tmp_path: Path, caplog
+):
+    first = make_runner(tmp_path / "first")
+    first.learn(3)
+    second = make_runner(tmp_path / "second", num_envs=6)
+    second.load(str(tmp_path / "first" / "model_2.pt"))
+    for one, other in zip(first.alg.actor.parameters(), second.alg.actor.parameters(), strict=True):
+        assert torch.equal(one, other)
+    second.learn(4)
+    assert second.current_learning_iteration == 4
+    assert "--num-envs 8" in caplog.text
+
+
+def test_loading_a_policy_touches_neither_generators_nor_environments(make_runner, tmp_path: Path):
+    make_runner(tmp_path / "run").learn(2)
+    player = make_runner()
+    position, generators = player.env.unwrapped.position.clone(), torch.get_rng_state()
+    player.load(str(tmp_path / "run" / "model_1.pt"), load_cfg={"actor": True})
+    assert torch.equal(player.env.unwrapped.position, position)
+    assert torch.equal(torch.get_rng_state(), generators)
+    assert player.current_learning_iteration == 0
+    # The step counter comes along, so that curricula are at the trained stage.
+    assert player.env.unwrapped.common_step_counter == 10
+
+
+def test_a_finished_run_has_nothing_left_to_train(make_runner, tmp_path: Path, caplog):
+    make_runner(tmp_path / "first").learn(2)
+    again = make_runner(tmp_path / "second")
+    again.load(str(tmp_path / "first" / "model_1.pt"))
+    again.learn(2)
+    assert "has finished 2 iterations" in caplog.text
+    assert not list((tmp_path / "second").glob("model_*"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_training_with_a_checkpoint_that_resumes(make_runner, tmp_path: Path, number):
+    straight = make_runner(tmp_path / "straight")
+    straight.learn(5)
+    expected = everything(straight)
+
+    class Interrupt(Recorder):
+        def on_iteration(self, stats):
+            if stats.iteration == 2:
+                os.kill(os.getpid(), number)
+
+    before = signal.getsignal(number)
+    runner, observer = make_runner(tmp_path / "run"), Interrupt()
+    runner.observers.append(observer)
+    runner.learn(5)
+    assert runner.stop_reason == "interrupted"
+    assert ("stop", number.name) in observer.events
+    assert observer.events[-1] == (
+        "end",
+        "interrupted",
+    )
+    assert signal.getsignal(number) is before
+    resumed = make_runner(tmp_path / "resumed")
+    resumed.load(str(tmp_path / "run" / f"model_{runner.current_learning_iteration - 1}.pt"))
+    resumed.learn(5)
+    assert_same_bits(everything(resumed), expected)
+
+
+def test_a_second_signal_is_not_held_back(make_runner, tmp_path: Path):
+    class InterruptTwice(TrainingObserver):
+        def on_iteration(self, stats):
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    runner = make_runner(tmp_path / "run")
+    runner.observers.append(InterruptTwice())
+    with pytest.raises(KeyboardInterrupt):
+        runner.learn(5)
+    assert runner.stop_reason == "failed"
+
+
+def solved_at(value: float, **changes) -> dict:
+    return asdict(EvaluationCfg(solved_return=value, num_episodes=4, min_interval=1, **changes))
+
+
+def test_training_stops_when_solved_and_evaluation_leaves_no_trace(make_runner, tmp_path: Path):
+    plain = make_runner(tmp_path / "plain")
+    plain.learn(2)
+    expected = everything(plain)
+
+    recorder = Recorder()
+    # A return that the second evaluation reaches for sure, and no other: every policy does.
+    runner = make_runner(tmp_path / "run", evaluation=solved_at(0.01) | {"min_interval": 2})
+    runner.observers.append(recorder)
+    runner.learn(50)
+    assert runner.stop_reason == "solved"
+    assert runner.current_learning_iteration == 2
+    assert ("evaluation", 2, True) in recorder.events
+    assert runner.last_evaluation.num_episodes == 4
+    assert runner.last_evaluation.mean_length <= 12
+    assert_same_bits(everything(runner), expected)
+
+
+def test_training_goes_on_when_told_so_and_when_not_solved(make_runner):
+    on = make_runner(evaluation=solved_at(0.01, stop_when_solved=False))
+    on.learn(3)
+    assert on.stop_reason == "finished"
+    assert on.last_evaluation is not None
+    # 12 steps have at most 12 reward; the training data reach the trigger, the evaluation fails.
+    unsolved = make_runner(evaluation=solved_at(13.0, trigger_fraction=0.0))
+    unsolved.learn(3)
+    assert unsolved.stop_reason == "finished"
+    assert unsolved.last_evaluation is not None
+    untried = make_runner(evaluation=solved_at(13.0, trigger_fraction=1.0))
+    untried.learn(3)
+    assert untried.last_evaluation is None
+
+
+def test_statistics_are_those_of_the_episodes(make_runner, tmp_path: Path):
+    runner, recorder = make_runner(env_cfg={"always_terminate": True}), Recorder()
+    runner.observers.append(recorder)
+    runner.learn(2)
+    stats = recorder.stats[-1]
+    assert stats.iteration == 2
+    assert stats.total_iterations == 2
+    assert stats.time_left == 0.0
+    assert stats.total_steps == 2 * 5 * 8
+    assert stats.mean_episode_length == 1.0
+    # Rewards are in units of the step's half second; `mean_step_reward` is not.
+    assert 0.0 < stats.mean_reward < 0.5
+    assert stats.mean_step_reward > stats.mean_reward
+    assert stats.environment["Episode/plain"] == 2.0
+    assert stats.environment["Metrics/distance"] > 0.0
+    assert set(stats.losses) == {"value", "surrogate", "entropy"}
+    assert stats.steps_per_second > 0.0
+
+
+def test_figures_are_in_the_event_files(make_runner, tmp_path: Path):
+    from mjlab.rl.plot import read_scalars
+
+    make_runner(tmp_path / "run").learn(4)
+    steps, values = read_scalars(tmp_path / "run", "Train/mean_step_reward")
+    assert steps.tolist() == [0, 1, 2, 3]
+    assert (values > 0).all()
+    for tag in ("Loss/value", "Perf/total_fps", "Policy/mean_std", "Metrics/distance"):
+        assert len(read_scalars(tmp_path / "run", tag)[0]) == 4
+
+
+def test_nan_from_the_environment_ends_training_and_names_the_group(make_runner, tmp_path: Path):
+    runner = make_runner(tmp_path / "run")
+    runner.learn(1)
+    runner.env.unwrapped.drift = torch.full((8, 2), torch.nan)
+    with pytest.raises(ValueError, match="'actor'.*NaN"):
+        runner.learn(3)
+    assert runner.stop_reason == "failed"
+    load_checkpoint(tmp_path / "run" / "model_0.pt")
+
+
+def test_an_unwritable_log_folder_is_one_error_before_training(make_runner, tmp_path: Path):
+    blocker = tmp_path / "file"
+    blocker.write_text("")
+    runner, recorder = make_runner(blocker / "run"), Recorder()
+    runner.observers.append(recorder)
+    with pytest.raises(RunFolderError, match="cannot be written to.*--log-root"):
+        runner.learn(2)
+    assert recorder.stats == []
+
+
+def test_a_full_disk_keeps_the_last_checkpoint(make_runner, tmp_path: Path, monkeypatch):
+    import errno
+
+    from mjlab.rl import checkpoint
+
+    runner = make_runner(tmp_path / "run")
+    runner.learn(1)
+    before = (tmp_path / "run" / "model_0.pt").read_bytes()
+
+    def fail(data, file):
+        file.write(b"half of it")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(checkpoint, "_write", fail)
+    with pytest.raises(CheckpointError, match="disk is full.*model_0.pt.*is intact"):
+        runner.learn(3)
+    assert (tmp_path / "run" / "model_0.pt").read_bytes() == before
+    assert not [path for path in (tmp_path / "run").iterdir() if "tmp" in path.name]
+
+
+def test_only_the_first_process_writes(make_runner, tmp_path: Path):
+    runner = make_runner(tmp_path / "run")
+    runner.gpu_global_rank = 1
+    runner.logger.disable_logs = True
+    runner.learn(2)
+    assert not (tmp_path / "run").exists()
+
+
+def test_nothing_is_printed(make_runner, tmp_path: Path, capsys):
+    make_runner(tmp_path / "run").learn(2)
+    assert capsys.readouterr().out == ""
+
+
+def test_weights_and_biases_gets_figures_and_files_only_on_request(
+    make_runner, tmp_path: Path, monkeypatch
+):
+    calls: list[tuple] = []
+    client = types.ModuleType("wandb")
+    for name in ("init", "log", "save", "finish"):
+        setattr(client, name, lambda *args, _name=name, **kwargs: calls.append((_name, args)))
+    client.config = types.SimpleNamespace(update=lambda values: calls.append(("config", values)))
+    monkeypatch.setitem(sys.modules, "wandb", client)
+
+    make_runner(tmp_path / "plain").learn(1)
+    assert calls == []
+    make_runner(tmp_path / "run", logger="wandb").learn(1)
+    names = [name for name, _ in calls]
+    assert names[0] == "init"
+    assert names[-1] == "finish"
+    assert any(name == "log" and "Loss/value" in args[0] for name, args in calls)
+    files = [Path(args[0]).name for name, args in calls if name == "save"]
+    # The difference of a git repository around the packages is saved too, where there is one.
+    saved = [name for name in files if not name.endswith(".diff")]
+    assert saved == ["model_0.pt", "run.onnx"]
+    # TensorBoard's file is written all the same.
+    assert list((tmp_path / "run").glob("events.*"))
+
+    calls.clear()
+    make_runner(tmp_path / "kept", logger="wandb", upload_model=False).learn(1)
+    assert not [args for name, args in calls if name == "save" and "kept." in args[0]]
+    assert not [args for name, args in calls if name == "save" and "model_" in args[0]]
