@@ -1,0 +1,7 @@
+"""Simulated things: their configuration, their state, and commands to them."""
+
+from mjlab.entity.data import EntityData as EntityData
+from mjlab.entity.entity import Entity as Entity
+from mjlab.entity.entity import EntityArticulationInfoCfg as EntityArticulationInfoCfg
+from mjlab.entity.entity import EntityCfg as EntityCfg
+from mjlab.entity.indexing import EntityIndexing as EntityIndexing

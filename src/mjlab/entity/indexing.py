@@ -1,0 +1,215 @@
+"""Where an entity's elements are in the compiled model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import mujoco
+import torch
+
+from mjlab.utils.mujoco import dof_width, qpos_width
+
+Ids: TypeAlias = torch.Tensor | slice | Sequence[int] | None
+"""A selection: None for all, a slice, or whole numbers (list, tensor) or a boolean mask."""
+
+
+class Addresses:
+    """Positions along one axis of a simulation field, and selections of them.
+
+    Positions that follow each other are handed out as a slice, so that reading a field gives a
+    view of it and nothing is copied.
+    """
+
+    def __init__(self, positions: Sequence[int] | torch.Tensor, device: str) -> None:
+        host = positions.tolist() if isinstance(positions, torch.Tensor) else list(positions)
+        self._host = [int(position) for position in host]
+        self._device = device
+        self.tensor = torch.tensor(self._host, dtype=torch.int64, device=device)
+        self.all: slice | torch.Tensor = self._shortest(self._host)
+        self.constant = self._host[0] if len(set(self._host)) == 1 else None
+
+    def __len__(self) -> int:
+        return len(self._host)
+
+    def select(self, ids: Ids = None) -> tuple[slice | torch.Tensor, int]:
+        """Return the index of the chosen positions, and how many there are."""
+        if ids is None:
+            return self.all, len(self._host)
+        if isinstance(ids, torch.Tensor):
+            chosen = self.tensor[ids]
+            return chosen, chosen.shape[0]
+        host = self._host[ids] if isinstance(ids, slice) else [self._host[int(i)] for i in ids]
+        return self._shortest(host), len(host)
+
+    def _shortest(self, host: list[int]) -> slice | torch.Tensor:
+        if not host:
+            return slice(0, 0)
+        if host == list(range(host[0], host[0] + len(host))):
+            return slice(host[0], host[0] + len(host))
+        return torch.tensor(host, dtype=torch.int64, device=self._device)
+
+
+@dataclass(eq=False)
+class EntityIndexing:
+    """Spec elements of one entity and their ids and addresses in the compiled model.
+
+    Ids are int32 tensors of global ids, in spec order.
+    """
+
+    bodies: tuple[mujoco.MjsBody, ...]
+    """All bodies but the world; the first is the root."""
+    joints: tuple[mujoco.MjsJoint, ...]
+    """All joints but the free one."""
+    geoms: tuple[mujoco.MjsGeom, ...]
+    sites: tuple[mujoco.MjsSite, ...]
+    tendons: tuple[mujoco.MjsTendon, ...]
+    cameras: tuple[mujoco.MjsCamera, ...]
+    lights: tuple[mujoco.MjsLight, ...]
+    materials: tuple[mujoco.MjsMaterial, ...]
+    textures: tuple[mujoco.MjsTexture, ...]
+    pairs: tuple[mujoco.MjsPair, ...]
+    actuators: tuple[mujoco.MjsActuator, ...] | None
+    """All actuators of the spec, or None if the entity has no configured actuators."""
+    body_ids: torch.Tensor
+    geom_ids: torch.Tensor
+    site_ids: torch.Tensor
+    tendon_ids: torch.Tensor
+    cam_ids: torch.Tensor
+    light_ids: torch.Tensor
+    mat_ids: torch.Tensor
+    tex_ids: torch.Tensor
+    pair_ids: torch.Tensor
+    ctrl_ids: torch.Tensor
+    """Ids of `actuators`; empty if that is None."""
+    joint_ids: torch.Tensor
+    mocap_id: int | None
+    """Index into `mocap_pos`, or None if the root is no mocap body."""
+    joint_q_adr: torch.Tensor
+    """Addresses in `qpos`, without the free joint."""
+    joint_v_adr: torch.Tensor
+    """Addresses in `qvel`, without the free joint."""
+    free_joint_q_adr: torch.Tensor
+    """The free joint's 7 addresses in `qpos`, or none."""
+    free_joint_v_adr: torch.Tensor
+    """The free joint's 6 addresses in `qvel`, or none."""
+    body_tree_ids: torch.Tensor
+    """For each body, the top-level body of its tree: `cvel` refers to that tree's centre of mass."""
+    geom_body_ids: torch.Tensor
+    """For each geom, the body it belongs to."""
+    geom_tree_ids: torch.Tensor
+    """For each geom, the top-level body of its tree."""
+    site_body_ids: torch.Tensor
+    """For each site, the body it belongs to."""
+    site_tree_ids: torch.Tensor
+    """For each site, the top-level body of its tree."""
+
+    @property
+    def root_body_id(self) -> int:
+        """Global id of the root body."""
+        return self._root_id
+
+    _root_id: int = -1
+
+
+def build_indexing(
+    spec: mujoco.MjSpec,
+    free_joint: mujoco.MjsJoint | None,
+    is_actuated: bool,
+    model: mujoco.MjModel,
+    device: str,
+) -> EntityIndexing:
+    """Find the elements of an entity's `spec` in the compiled `model`.
+
+    Raises:
+        ValueError: an element is not in the model, or is unnamed in a spec that was not compiled.
+    """
+
+    def tensor(values: Iterable[int]) -> torch.Tensor:
+        return torch.tensor([int(v) for v in values], dtype=torch.int32, device=device)
+
+    elements: dict[str, tuple[Any, ...]] = {
+        "bodies": tuple(spec.bodies[1:]),
+        "joints": tuple(joint for joint in spec.joints if joint is not free_joint),
+        **{kind: tuple(getattr(spec, kind)) for kind in _OBJECT_TYPES if kind not in _SPECIAL},
+    }
+    actuators = elements.pop("actuators")
+    ids = {kind: element_ids(model, kind, found) for kind, found in elements.items()}
+    ctrl_ids = element_ids(model, "actuators", actuators) if is_actuated else []
+    joints = [(int(model.jnt_type[i]), i) for i in ids["joints"]]
+    free = [] if free_joint is None else element_ids(model, "joints", (free_joint,))
+    geom_bodies = [int(model.geom_bodyid[i]) for i in ids["geoms"]]
+    site_bodies = [int(model.site_bodyid[i]) for i in ids["sites"]]
+    root = ids["bodies"][0]
+    mocap_id = int(model.body_mocapid[root])
+    return EntityIndexing(
+        **elements,
+        actuators=actuators if is_actuated else None,
+        body_ids=tensor(ids["bodies"]),
+        geom_ids=tensor(ids["geoms"]),
+        site_ids=tensor(ids["sites"]),
+        tendon_ids=tensor(ids["tendons"]),
+        cam_ids=tensor(ids["cameras"]),
+        light_ids=tensor(ids["lights"]),
+        mat_ids=tensor(ids["materials"]),
+        tex_ids=tensor(ids["textures"]),
+        pair_ids=tensor(ids["pairs"]),
+        ctrl_ids=tensor(ctrl_ids),
+        joint_ids=tensor(ids["joints"]),
+        mocap_id=mocap_id if mocap_id >= 0 else None,
+        joint_q_adr=tensor(
+            model.jnt_qposadr[i] + k for kind, i in joints for k in range(qpos_width(kind))
+        ),
+        joint_v_adr=tensor(
+            model.jnt_dofadr[i] + k for kind, i in joints for k in range(dof_width(kind))
+        ),
+        free_joint_q_adr=tensor(model.jnt_qposadr[i] + k for i in free for k in range(7)),
+        free_joint_v_adr=tensor(model.jnt_dofadr[i] + k for i in free for k in range(6)),
+        body_tree_ids=tensor(model.body_rootid[i] for i in ids["bodies"]),
+        geom_body_ids=tensor(geom_bodies),
+        geom_tree_ids=tensor(model.body_rootid[i] for i in geom_bodies),
+        site_body_ids=tensor(site_bodies),
+        site_tree_ids=tensor(model.body_rootid[i] for i in site_bodies),
+        _root_id=root,
+    )
+
+
+_OBJECT_TYPES = {
+    "bodies": mujoco.mjtObj.mjOBJ_BODY,
+    "joints": mujoco.mjtObj.mjOBJ_JOINT,
+    "geoms": mujoco.mjtObj.mjOBJ_GEOM,
+    "sites": mujoco.mjtObj.mjOBJ_SITE,
+    "tendons": mujoco.mjtObj.mjOBJ_TENDON,
+    "cameras": mujoco.mjtObj.mjOBJ_CAMERA,
+    "lights": mujoco.mjtObj.mjOBJ_LIGHT,
+    "materials": mujoco.mjtObj.mjOBJ_MATERIAL,
+    "textures": mujoco.mjtObj.mjOBJ_TEXTURE,
+    "pairs": mujoco.mjtObj.mjOBJ_PAIR,
+    "actuators": mujoco.mjtObj.mjOBJ_ACTUATOR,
+}
+_SPECIAL = ("bodies", "joints")
+
+
+def element_ids(model: mujoco.MjModel, kind: str, elements: Iterable[Any]) -> list[int]:
+    """Return the ids of spec elements in `model`: by name, or by spec order without a name."""
+    return [_element_id(model, kind, element) for element in elements]
+
+
+def _element_id(model: mujoco.MjModel, kind: str, element: Any) -> int:
+    object_type = _OBJECT_TYPES[kind]
+    what = object_type.name.removeprefix("mjOBJ_").lower()
+    if element.name:
+        found = mujoco.mj_name2id(model, object_type, element.name)
+        if found < 0:
+            raise ValueError(
+                f"The compiled model has no {what} {element.name!r}. Initialize an entity with "
+                "the model that was compiled from the spec it belongs to."
+            )
+        return found
+    if element.id < 0:
+        raise ValueError(
+            f"A {what} without a name cannot be found in the model, because its spec was changed "
+            "after it was compiled. Compile that spec, not a copy of it."
+        )
+    return element.id

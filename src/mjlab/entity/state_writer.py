@@ -1,0 +1,241 @@
+"""Writing the state of one entity into the simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from mjlab.entity.indexing import Addresses, Ids
+from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
+
+if TYPE_CHECKING:
+    from mjlab.entity.indexing import EntityIndexing
+
+EnvIds = torch.Tensor | slice | None
+
+
+def assign(
+    field: torch.Tensor,
+    value: torch.Tensor | float,
+    env_ids: EnvIds,
+    columns: slice | torch.Tensor | int,
+) -> None:
+    """Write `value` into rows `env_ids` and `columns` of `field`; tensors select their product."""
+    if env_ids is None:
+        field[:, columns] = value
+    elif isinstance(columns, torch.Tensor) and not isinstance(env_ids, slice):
+        field[_row_numbers(env_ids)[:, None], columns] = value
+    else:
+        field[env_ids, columns] = value
+
+
+def rows(field: torch.Tensor, env_ids: EnvIds) -> torch.Tensor:
+    """Return the rows `env_ids` of `field`."""
+    return field if env_ids is None else field[env_ids]
+
+
+def check_width(value: Any, width: int, what: str) -> None:
+    """Raise `ValueError` unless the last dimension of a tensor `value` is `width`."""
+    if isinstance(value, torch.Tensor) and value.ndim > 0 and value.shape[-1] != width:
+        raise ValueError(
+            f"{what} has {value.shape[-1]} values per environment (shape {tuple(value.shape)}), "
+            f"but {width} are to be written. Give a tensor of shape (number of envs, {width})."
+        )
+
+
+def _row_numbers(env_ids: torch.Tensor) -> torch.Tensor:
+    env_ids = torch.as_tensor(env_ids)
+    return env_ids.nonzero().flatten() if env_ids.dtype == torch.bool else env_ids
+
+
+class StateWriter:
+    """The writers of `EntityData`.
+
+    `env_ids` is None (all), a slice, a boolean mask or a one-dimensional tensor of indices; element
+    ids, which count within the entity, may also be a list. Tensors of both select their product.
+
+    Writes go straight to the simulation. What derives from the state (`body_link_pos_w`, velocities
+    of links, sensors, ...) keeps its old values until the next `sim.forward()`.
+    """
+
+    indexing: EntityIndexing
+    data: Any
+    model: Any
+    is_fixed_base: bool
+    is_articulated: bool
+    is_actuated: bool
+    _joint_q: Addresses
+    _joint_v: Addresses
+    _bodies: Addresses
+    _ctrl: Addresses
+    _free_q: slice
+    _free_v: slice
+
+    def write_root_state(self, root_state: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write pose and velocity of the root link, (k, 13): see the next two writers."""
+        self._require_floating("write_root_state")
+        check_width(root_state, 13, "The root state")
+        self.write_root_pose(root_state[..., :7], env_ids)
+        self.write_root_velocity(root_state[..., 7:], env_ids)
+
+    def write_root_pose(self, pose: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write the world pose of the root link, (k, 7): position, quaternion (w, x, y, z).
+
+        Raises:
+            ValueError: the entity has a fixed base, or the width is wrong.
+        """
+        self._require_floating("write_root_pose")
+        check_width(pose, 7, "The root pose")
+        assign(self.data.qpos, pose, env_ids, self._free_q)
+
+    def write_root_velocity(self, velocity: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write the world velocity of the root link, (k, 6): linear (of its origin), angular.
+
+        MuJoCo keeps the angular part in the body frame, so it is rotated by the orientation that
+        `qpos` holds now: write the pose first.
+
+        Raises:
+            ValueError: the entity has a fixed base, or the width is wrong.
+        """
+        self._require_floating("write_root_velocity")
+        check_width(velocity, 6, "The root velocity")
+        linear, angular = velocity[..., :3], velocity[..., 3:]
+        quat = self._root_quat(env_ids)
+        linear, angular = linear.expand(len(quat), 3), angular.expand(len(quat), 3)
+        angular_b = quat_apply_inverse(quat, angular)
+        assign(self.data.qvel, torch.cat((linear, angular_b), dim=-1), env_ids, self._free_v)
+
+    def write_root_velocity_b(self, velocity_b: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write the velocity of the root link given in its own frame, (k, 6): linear, angular.
+
+        Raises:
+            ValueError: the entity has a fixed base, or the width is wrong.
+        """
+        self._require_floating("write_root_velocity_b")
+        check_width(velocity_b, 6, "The root velocity")
+        linear_b, angular_b = velocity_b[..., :3], velocity_b[..., 3:]
+        quat = self._root_quat(env_ids)
+        linear_b, angular_b = linear_b.expand(len(quat), 3), angular_b.expand(len(quat), 3)
+        linear = quat_apply(quat, linear_b)
+        assign(self.data.qvel, torch.cat((linear, angular_b), dim=-1), env_ids, self._free_v)
+
+    def write_root_com_velocity(self, velocity: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write the world velocity of the root body's centre of mass, (k, 6): linear, angular.
+
+        The origin of the link then moves with `v_com - omega x (R body_ipos)`.
+
+        Raises:
+            ValueError: the entity has a fixed base, or the width is wrong.
+        """
+        self._require_floating("write_root_com_velocity")
+        check_width(velocity, 6, "The root velocity")
+        linear, angular = velocity[..., :3], velocity[..., 3:]
+        offset_b = rows(self.model.body_ipos[:, self.indexing.root_body_id], env_ids)
+        offset = quat_apply(self._root_quat(env_ids), offset_b)
+        angular = angular.expand_as(offset)
+        linear = linear - torch.linalg.cross(angular, offset)
+        self.write_root_velocity(torch.cat((linear, angular), dim=-1), env_ids)
+
+    def write_joint_state(
+        self,
+        position: torch.Tensor,
+        velocity: torch.Tensor,
+        joint_ids: Ids = None,
+        env_ids: EnvIds = None,
+    ) -> None:
+        """Write joint positions and velocities, (k, number of joints) each."""
+        self.write_joint_position(position, joint_ids, env_ids)
+        self.write_joint_velocity(velocity, joint_ids, env_ids)
+
+    def write_joint_position(
+        self, position: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
+    ) -> None:
+        """Write joint positions, (k, number of joints).
+
+        Raises:
+            ValueError: the entity has no joints, or the width is wrong.
+        """
+        self._require_articulated("write_joint_position")
+        columns, width = self._joint_q.select(joint_ids)
+        check_width(position, width, "The joint position")
+        assign(self.data.qpos, position, env_ids, columns)
+
+    def write_joint_velocity(
+        self, velocity: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
+    ) -> None:
+        """Write joint velocities, (k, number of joints).
+
+        Raises:
+            ValueError: the entity has no joints, or the width is wrong.
+        """
+        self._require_articulated("write_joint_velocity")
+        columns, width = self._joint_v.select(joint_ids)
+        check_width(velocity, width, "The joint velocity")
+        assign(self.data.qvel, velocity, env_ids, columns)
+
+    def write_external_wrench(
+        self,
+        force: torch.Tensor | None,
+        torque: torch.Tensor | None,
+        body_ids: Sequence[int] | torch.Tensor | slice | None = None,
+        env_ids: EnvIds = None,
+    ) -> None:
+        """Set force and torque on bodies, (k, number of bodies, 3) each; None leaves a half alone.
+
+        World frame, acting at the bodies' centres of mass. They persist until they are overwritten
+        or the environment is reset.
+        """
+        columns, _ = self._bodies.select(body_ids)
+        wrench = self.data.xfrc_applied
+        for value, half, what in ((force, slice(0, 3), "force"), (torque, slice(3, 6), "torque")):
+            if value is not None:
+                check_width(value, 3, f"The external {what}")
+                assign(wrench[..., half], value, env_ids, columns)
+
+    def write_ctrl(self, ctrl: torch.Tensor, ctrl_ids: Ids = None, env_ids: EnvIds = None) -> None:
+        """Write controls, (k, number of actuators); `ctrl_ids` count within the entity.
+
+        Raises:
+            ValueError: the entity has no configured actuators, or the width is wrong.
+        """
+        if not self.is_actuated:
+            raise ValueError(
+                "write_ctrl: this entity has no actuators. List them in "
+                "EntityCfg.articulation.actuators."
+            )
+        columns, width = self._ctrl.select(ctrl_ids)
+        check_width(ctrl, width, "The control")
+        assign(self.data.ctrl, ctrl, env_ids, columns)
+
+    def write_mocap_pose(self, pose: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write the pose of the mocap root, (k, 7): position, quaternion (w, x, y, z).
+
+        Raises:
+            ValueError: the root is no mocap body, or the width is wrong.
+        """
+        mocap_id = self.indexing.mocap_id
+        if mocap_id is None:
+            raise ValueError(
+                "write_mocap_pose: the root of this entity is no mocap body. Place a floating "
+                "entity with write_root_pose."
+            )
+        check_width(pose, 7, "The mocap pose")
+        assign(self.data.mocap_pos, pose[..., :3], env_ids, mocap_id)
+        assign(self.data.mocap_quat, pose[..., 3:], env_ids, mocap_id)
+
+    def _root_quat(self, env_ids: EnvIds) -> torch.Tensor:
+        """Return the root orientations (k, 4) that `qpos` holds now."""
+        return rows(self.data.qpos[:, self._free_q], env_ids)[:, 3:7]
+
+    def _require_floating(self, what: str) -> None:
+        if self.is_fixed_base:
+            raise ValueError(
+                f"{what}: this entity has a fixed base. Place it with write_mocap_pose, or give "
+                "its root body a free joint."
+            )
+
+    def _require_articulated(self, what: str) -> None:
+        if not self.is_articulated:
+            raise ValueError(f"{what}: this entity has no joints other than a free one.")
