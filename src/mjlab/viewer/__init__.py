@@ -1,0 +1,45 @@
+"""What a person looks at: browser viewer, native window, offscreen images and videos.
+
+The names are loaded on first use, so that a config can import `ViewerConfig` without paying for
+MuJoCo, torch or viser.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mjlab.viewer.base import BaseViewer as BaseViewer
+    from mjlab.viewer.base import EnvProtocol as EnvProtocol
+    from mjlab.viewer.base import PolicyProtocol as PolicyProtocol
+    from mjlab.viewer.base import VerbosityLevel as VerbosityLevel
+    from mjlab.viewer.errors import RenderingUnavailableError as RenderingUnavailableError
+    from mjlab.viewer.headless import run_headless as run_headless
+    from mjlab.viewer.native import NativeMujocoViewer as NativeMujocoViewer
+    from mjlab.viewer.offscreen_renderer import OffscreenRenderer as OffscreenRenderer
+    from mjlab.viewer.video_recorder import VideoRecorder as VideoRecorder
+    from mjlab.viewer.viewer_config import ViewerConfig as ViewerConfig
+    from mjlab.viewer.viser import ViserPlayViewer as ViserPlayViewer
+
+_HOMES = {
+    "BaseViewer": "mjlab.viewer.base",
+    "EnvProtocol": "mjlab.viewer.base",
+    "PolicyProtocol": "mjlab.viewer.base",
+    "VerbosityLevel": "mjlab.viewer.base",
+    "RenderingUnavailableError": "mjlab.viewer.errors",
+    "run_headless": "mjlab.viewer.headless",
+    "NativeMujocoViewer": "mjlab.viewer.native",
+    "OffscreenRenderer": "mjlab.viewer.offscreen_renderer",
+    "VideoRecorder": "mjlab.viewer.video_recorder",
+    "ViewerConfig": "mjlab.viewer.viewer_config",
+    "ViserPlayViewer": "mjlab.viewer.viser",
+}
+
+__all__ = sorted(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(importlib.import_module(_HOMES[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,199 @@
+"""The drawing board that terms and sensors get in `debug_vis`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import mujoco
+
+Color = tuple[float, float, float, float]
+"""Red, green, blue and opacity, each in [0, 1]."""
+
+DEFAULT_AXIS_COLORS = ((0.9, 0.0, 0.0), (0.0, 0.9, 0.0), (0.0, 0.0, 0.9))
+"""Colours of the x, y and z arrows of a frame."""
+
+MIN_LENGTH = 1e-6
+"""Arrows and cylinders shorter than this (metres) have no direction and are not drawn."""
+
+
+class DebugVisualizer(ABC):
+    """Draws primitives over the scene. All poses are in the world frame, lengths in metres.
+
+    What is drawn lasts for one displayed frame: the viewer clears the board and asks again.
+    `label` names an item for the reader of the code; no viewer shows it.
+    """
+
+    env_idx: int = 0
+    """The environment in view."""
+    show_all_envs: bool = False
+    """Whether terms should draw for every environment, not only for the one in view."""
+
+    def get_env_indices(self, num_envs: int) -> Iterable[int]:
+        """Environments to draw for: all, or the one in view, or none where it does not exist."""
+        if self.show_all_envs:
+            return range(num_envs)
+        return (self.env_idx,) if 0 <= self.env_idx < num_envs else ()
+
+    @property
+    @abstractmethod
+    def meansize(self) -> float:
+        """Typical size of a body in the model (m), to scale drawings by."""
+
+    @abstractmethod
+    def add_arrow(
+        self,
+        start: np.ndarray,
+        end: np.ndarray,
+        color: Color,
+        width: float = 0.015,
+        label: str | None = None,
+    ) -> None:
+        """Draw an arrow between two points (3,); `width` is the radius of its shaft."""
+
+    @abstractmethod
+    def add_sphere(
+        self, center: np.ndarray, radius: float, color: Color, label: str | None = None
+    ) -> None:
+        """Draw a sphere."""
+
+    @abstractmethod
+    def add_cylinder(
+        self,
+        start: np.ndarray,
+        end: np.ndarray,
+        radius: float,
+        color: Color,
+        label: str | None = None,
+    ) -> None:
+        """Draw a cylinder whose flat ends are centred on two points (3,)."""
+
+    @abstractmethod
+    def add_ellipsoid(
+        self,
+        center: np.ndarray,
+        size: np.ndarray,
+        mat: np.ndarray,
+        color: Color,
+        label: str | None = None,
+    ) -> None:
+        """Draw an ellipsoid with semi-axes `size` (3,) along the columns of `mat` (3, 3)."""
+
+    @abstractmethod
+    def add_box(
+        self,
+        center: np.ndarray,
+        size: np.ndarray,
+        mat: np.ndarray,
+        color: Color,
+        label: str | None = None,
+    ) -> None:
+        """Draw a box with half-extents `size` (3,) along the columns of `mat` (3, 3)."""
+
+    @abstractmethod
+    def add_ghost_mesh(
+        self,
+        qpos: np.ndarray,
+        model: mujoco.MjModel,
+        mocap_pos: np.ndarray | None = None,
+        mocap_quat: np.ndarray | None = None,
+        alpha: float = 0.5,
+        label: str | None = None,
+    ) -> None:
+        """Draw the moving bodies of `model` at configuration `qpos` (nq,), see-through.
+
+        A mocap pose of shape (3,) or (4,) goes to mocap body 0, one of shape (nmocap, 3) or
+        (nmocap, 4) to all of them.
+        """
+
+    @abstractmethod
+    def clear(self) -> None:
+        """Remove everything drawn."""
+
+    def add_frame(
+        self,
+        position: np.ndarray,
+        rotation_matrix: np.ndarray,
+        scale: float = 0.3,
+        label: str | None = None,
+        axis_radius: float = 0.01,
+        alpha: float = 1.0,
+        axis_colors: tuple[tuple[float, float, float], ...] | None = None,
+    ) -> None:
+        """Draw a coordinate frame as three arrows of length `scale`."""
+        position = np.asarray(position, dtype=float)
+        rotation = np.asarray(rotation_matrix, dtype=float).reshape(3, 3)
+        for axis, (red, green, blue) in enumerate(axis_colors or DEFAULT_AXIS_COLORS):
+            end = position + scale * rotation[:, axis]
+            self.add_arrow(position, end, (red, green, blue, alpha), axis_radius, label)
+
+
+class NullDebugVisualizer:
+    """Accepts every drawing call and draws nothing."""
+
+    def __init__(self, env_idx: int = 0, meansize: float = 0.1):
+        self.env_idx = env_idx
+        self.show_all_envs = False
+        self._meansize = meansize
+
+    @property
+    def meansize(self) -> float:
+        return self._meansize
+
+    def get_env_indices(self, num_envs: int) -> Iterable[int]:
+        return (self.env_idx,) if 0 <= self.env_idx < num_envs else ()
+
+    def add_arrow(self, start, end, color, width=0.015, label=None) -> None:
+        pass
+
+    def add_frame(
+        self,
+        position,
+        rotation_matrix,
+        scale=0.3,
+        label=None,
+        axis_radius=0.01,
+        alpha=1.0,
+        axis_colors=None,
+    ) -> None:
+        pass
+
+    def add_sphere(self, center, radius, color, label=None) -> None:
+        pass
+
+    def add_cylinder(self, start, end, radius, color, label=None) -> None:
+        pass
+
+    def add_ellipsoid(self, center, size, mat, color, label=None) -> None:
+        pass
+
+    def add_box(self, center, size, mat, color, label=None) -> None:
+        pass
+
+    def add_ghost_mesh(
+        self, qpos, model, mocap_pos=None, mocap_quat=None, alpha=0.5, label=None
+    ) -> None:
+        pass
+
+    def clear(self) -> None:
+        pass
+
+
+def pose_ghost(
+    data: mujoco.MjData,
+    qpos: np.ndarray,
+    mocap_pos: np.ndarray | None,
+    mocap_quat: np.ndarray | None,
+) -> None:
+    """Write a ghost's configuration into `data`: one mocap pose for body 0, or one for each."""
+    data.qpos[:] = qpos
+    if mocap_pos is not None:
+        positions = np.atleast_2d(mocap_pos)
+        data.mocap_pos[: len(positions)] = positions
+    if mocap_quat is not None:
+        rotations = np.atleast_2d(mocap_quat)
+        data.mocap_quat[: len(rotations)] = rotations

@@ -1,0 +1,25 @@
+"""The one error that says: this machine cannot draw."""
+
+from __future__ import annotations
+
+import os
+
+_INSTALL_HINT = (
+    "To render without a display, install libegl1 (`apt-get install libegl1`), or install "
+    "libosmesa6 (`apt-get install libosmesa6`) and set MUJOCO_GL=osmesa."
+)
+
+
+class RenderingUnavailableError(RuntimeError):
+    """Raised where an image or a window was asked for and this machine cannot draw one.
+
+    Its text is one line that says what failed and what to install, so that a caller can go on
+    without pictures: `except RenderingUnavailableError as error: log.warning("%s", error)`.
+    """
+
+    @classmethod
+    def offscreen(cls, cause: BaseException | str) -> RenderingUnavailableError:
+        """The error for an OpenGL context that could not be made, whatever the library said."""
+        backend = os.environ.get("MUJOCO_GL") or "unset"
+        reason = " ".join(str(cause).split()) or type(cause).__name__
+        return cls(f"Cannot render offscreen (MUJOCO_GL={backend}): {reason}. {_INSTALL_HINT}")

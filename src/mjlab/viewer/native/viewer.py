@@ -1,0 +1,280 @@
+"""MuJoCo's own window, following one environment of a running policy."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction
+from mjlab.viewer.camera import first_moving_body, nearest_envs, resolve_camera
+from mjlab.viewer.errors import RenderingUnavailableError
+from mjlab.viewer.history import TermHistory
+from mjlab.viewer.model_sync import (
+    compute_poses,
+    copy_state,
+    host_model,
+    sync_model_fields,
+    to_numpy,
+)
+from mjlab.viewer.native.display import require_display
+from mjlab.viewer.native.keys import KEY_HELP, action_of_key
+from mjlab.viewer.native.perturbation import MousePush
+from mjlab.viewer.native.reward_plots import PLOT_POINTS, reward_figures
+from mjlab.viewer.native.visualizer import MujocoNativeDebugVisualizer
+
+if TYPE_CHECKING:
+    import mujoco.viewer
+
+    from mjlab.viewer.base import EnvProtocol, PolicyProtocol
+
+log = logging.getLogger(__name__)
+
+_MARKER_COLOR = (0.9, 0.1, 0.1, 0.9)
+_CLOSING_TIMEOUT_S = 5.0
+_NO_PERTURBATION = mujoco.MjvPerturb()
+
+
+class NativeMujocoViewer(BaseViewer):
+    """Shows one environment, its nearest neighbours, rewards and debug drawings in a window.
+
+    Double-click selects a body, Ctrl-drag pushes or twists it. Keys are listed in the window;
+    they are ones that MuJoCo's window does not use itself. What is computed for display (contacts,
+    say) comes from a CPU forward pass, also where the environment runs on a GPU.
+    """
+
+    def __init__(
+        self,
+        env: EnvProtocol,
+        policy: PolicyProtocol,
+        frame_rate: float = 60.0,
+        key_callback: Callable[[int], None] | None = None,
+        enable_perturbations: bool = True,
+        verbosity: int = VerbosityLevel.SILENT,
+    ) -> None:
+        """Prepare; the window opens in `run` (or `setup`).
+
+        Args:
+            env: Environment or wrapper whose observations `policy` takes.
+            policy: Maps observations to actions.
+            frame_rate: Displayed frames per second of wall time.
+            key_callback: Also called with every key (GLFW code), in the window's thread.
+            enable_perturbations: Whether the mouse can push bodies.
+            verbosity: How much to log, a `VerbosityLevel`.
+        """
+        super().__init__(env, policy, frame_rate, verbosity)
+        self._user_key_callback = key_callback
+        self._enable_perturbations = enable_perturbations
+        unwrapped = env.unwrapped
+        self._model = host_model(unwrapped.sim.mj_model)
+        # Neighbours are posed in a model of their own, so that the window's is changed only
+        # while it is locked.
+        self._extra_model = host_model(unwrapped.sim.mj_model)
+        if self.cfg.fovy is not None:
+            self._model.vis.global_.fovy = self.cfg.fovy
+        self._data = mujoco.MjData(self._model)
+        self._extra_data = mujoco.MjData(self._extra_model)
+        self._view = resolve_camera(self.cfg, self._model, unwrapped.scene.entities)
+        self._marked_body = (
+            self._view.body_id if self._view.body_id is not None else first_moving_body(self._model)
+        )
+        self.env_idx = min(max(self.cfg.env_idx, 0), unwrapped.num_envs - 1)
+        self._rewards = TermHistory(PLOT_POINTS)
+        self._push = MousePush(self._model)
+        self._show_plots = False
+        self._show_debug = True
+        self._show_all_debug = False
+        self._handle: mujoco.viewer.Handle | None = None
+        self._window_threads: set[threading.Thread] = set()
+        self._visualizer: MujocoNativeDebugVisualizer | None = None
+
+    def setup(self) -> None:
+        """Open the window.
+
+        Raises:
+            RenderingUnavailableError: There is no display.
+        """
+        require_display()
+        import mujoco.viewer
+
+        self._load_selected()
+        others = set(threading.enumerate())
+        try:
+            self._handle = mujoco.viewer.launch_passive(
+                self._model,
+                self._data,
+                key_callback=self._on_key,
+                show_left_ui=False,
+                show_right_ui=False,
+            )
+        except Exception as error:
+            raise RenderingUnavailableError(
+                f"Cannot open MuJoCo's window: {error}. Use the browser viewer (--viewer viser)."
+            ) from error
+        self._window_threads = set(threading.enumerate()) - others
+        self._configure_window(self._handle)
+
+    def is_running(self) -> bool:
+        return self._handle is not None and self._handle.is_running()
+
+    def close(self) -> None:
+        if self._handle is not None:
+            self._push.release(self.env.unwrapped.sim)
+            self._handle.close()
+            self._handle = None
+        # The window's thread draws a last frame after it was told to end. A program that ends
+        # meanwhile takes the graphics library away from under it, and crashes.
+        for thread in self._window_threads:
+            thread.join(timeout=_CLOSING_TIMEOUT_S)
+        self._window_threads = set()
+
+    def sync_env_to_viewer(self) -> None:
+        handle = self._handle
+        if handle is None or not handle.is_running():
+            return
+        with handle.lock():
+            self._load_selected()
+            self._draw_extras(handle.user_scn)
+        handle.set_texts(self._overlay())
+        if self._show_plots and handle.viewport is not None:
+            handle.set_figures(reward_figures(self._rewards, handle.viewport))
+        handle.sync()
+
+    def sync_viewer_to_env(self) -> None:
+        handle = self._handle
+        if handle is None or not self._enable_perturbations:
+            return
+        # Without a push there is nothing to wait for the window's lock for.
+        if handle.perturb.active or self._push.active:
+            with handle.lock():
+                self._push.apply(self.env.unwrapped.sim, self.env_idx, self._data, handle.perturb)
+
+    def after_env_step(self) -> None:
+        manager = self.env.unwrapped.reward_manager
+        self._rewards.add(manager.get_active_iterable_terms(self.env_idx))
+
+    def after_reset(self) -> None:
+        self._rewards.clear()
+
+    def on_paused(self, paused: bool) -> None:
+        self.env.unwrapped.command_manager.on_viewer_pause(paused)
+
+    def handle_action(self, action: ViewerAction, payload: Any) -> bool:
+        if action in (ViewerAction.PREV_ENV, ViewerAction.NEXT_ENV):
+            self.select_env(self.env_idx + (1 if action is ViewerAction.NEXT_ENV else -1))
+        elif action is ViewerAction.TOGGLE_PLOTS:
+            self._show_plots = not self._show_plots
+            if not self._show_plots and self._handle is not None:
+                self._handle.clear_figures()
+        elif action is ViewerAction.TOGGLE_DEBUG_VIS:
+            self._show_debug = not self._show_debug
+        elif action is ViewerAction.TOGGLE_SHOW_ALL_ENVS:
+            self._show_all_debug = not self._show_all_debug
+        else:
+            return False
+        return True
+
+    def select_env(self, env_idx: int) -> None:
+        """Show another environment; numbers wrap around. A push on the old one ends."""
+        self._push.release(self.env.unwrapped.sim)
+        self.env_idx = env_idx % self.env.unwrapped.num_envs
+        self._rewards.clear()
+
+    def _on_key(self, key: int) -> None:
+        # This is the window's thread; the main thread performs the action.
+        action = action_of_key(key)
+        if action is not None:
+            self.request_action(action.value)
+        if self._user_key_callback is not None:
+            self._user_key_callback(key)
+
+    def _configure_window(self, handle: mujoco.viewer.Handle) -> None:
+        with handle.lock():
+            camera = handle.cam
+            camera.lookat[:] = self._view.target(self._data.xpos)
+            camera.distance = self._view.distance
+            camera.azimuth = self._view.azimuth
+            camera.elevation = self._view.elevation
+            if self._view.body_id is not None:
+                camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+                camera.trackbodyid = self._view.body_id
+            handle.opt.frame = mujoco.mjtFrame.mjFRAME_WORLD
+            handle.opt.flags[mujoco.mjtVisFlag.mjVIS_SCLINERTIA] = 1
+            handle.opt.geomgroup[:] = self.cfg.geom_group
+            handle.opt.sitegroup[:] = self.cfg.site_group
+            flags = handle.user_scn.flags
+            flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self.cfg.enable_shadows
+            flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = self.cfg.enable_reflections
+        self._visualizer = MujocoNativeDebugVisualizer(handle.user_scn, self._model)
+
+    def _load_selected(self) -> None:
+        sim = self.env.unwrapped.sim
+        if sim.expanded_fields:
+            sync_model_fields(self._model, sim.model, sim.expanded_fields, self.env_idx)
+        copy_state(sim, self.env_idx, self._data)
+        mujoco.mj_forward(self._model, self._data)
+
+    def _draw_extras(self, scn: mujoco.MjvScene) -> None:
+        scn.ngeom = 0
+        visualizer = self._visualizer
+        if visualizer is None:
+            return
+        visualizer.begin(self.env_idx, self._show_all_debug)
+        if self._show_debug:
+            self.env.unwrapped.update_visualizers(visualizer)
+        if self.env.unwrapped.num_envs > 1:
+            self._mark_selected(visualizer)
+            self._draw_neighbours(scn)
+
+    def _mark_selected(self, visualizer: MujocoNativeDebugVisualizer) -> None:
+        """Hang a red arrow over the followed body of the environment in view."""
+        if self._marked_body is None:
+            return
+        tip = self._data.xpos[self._marked_body] + np.array([0.0, 0.0, 0.5])
+        visualizer.add_arrow(tip + np.array([0.0, 0.0, 0.4]), tip, _MARKER_COLOR, width=0.03)
+
+    def _draw_neighbours(self, scn: mujoco.MjvScene) -> None:
+        env, sim = self.env.unwrapped, self.env.unwrapped.sim
+        origins = to_numpy(env.scene.env_origins)
+        option = mujoco.MjvOption()
+        option.geomgroup[:] = self.cfg.geom_group
+        option.sitegroup[:] = self.cfg.site_group
+        for env_idx in nearest_envs(origins, self.env_idx, self.cfg.max_extra_envs):
+            if sim.expanded_fields:
+                sync_model_fields(self._extra_model, sim.model, sim.expanded_fields, env_idx)
+            copy_state(sim, env_idx, self._extra_data)
+            compute_poses(self._extra_model, self._extra_data)
+            mujoco.mjv_addGeoms(
+                self._extra_model,
+                self._extra_data,
+                option,
+                _NO_PERTURBATION,
+                int(mujoco.mjtCatBit.mjCAT_DYNAMIC),
+                scn,
+            )
+
+    def _overlay(self) -> list[tuple[int | None, int | None, str | None, str | None]]:
+        status = self.get_status()
+        state = "paused" if status.paused else "CAPPED" if status.capped else "running"
+        rows = [
+            ("env", f"{self.env_idx + 1}/{self.env.unwrapped.num_envs}"),
+            ("step", f"{status.step_count}"),
+            ("status", state),
+            ("speed", status.speed_label),
+            (
+                "real time",
+                f"{status.actual_realtime:.2f}x of {status.target_realtime:g}x"
+                f" ({status.smoothed_fps:.0f} FPS)",
+            ),
+        ]
+        if status.last_error is not None:
+            rows.append(("error", status.last_error[:80]))
+        font = int(mujoco.mjtFontScale.mjFONTSCALE_150)
+        top, bottom = mujoco.mjtGridPos.mjGRID_TOPLEFT, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
+        names, values = ("\n".join(column) for column in zip(*rows, strict=True))
+        keys, meanings = ("\n".join(column) for column in zip(*KEY_HELP, strict=True))
+        return [(font, int(top), names, values), (font, int(bottom), keys, meanings)]

@@ -1,0 +1,185 @@
+"""Debug drawing into an `MjvScene`, used by the native window and the offscreen renderer."""
+
+from __future__ import annotations
+
+import logging
+
+import mujoco
+import numpy as np
+
+from mjlab.viewer.debug_visualizer import MIN_LENGTH, Color, DebugVisualizer, pose_ghost
+from mjlab.viewer.model_sync import compute_poses
+
+log = logging.getLogger(__name__)
+
+_NO_PERTURBATION = mujoco.MjvPerturb()
+
+
+class MujocoNativeDebugVisualizer(DebugVisualizer):
+    """Appends what terms draw to the geoms of a MuJoCo scene.
+
+    A scene has room for a fixed number of geoms. What does not fit is left out, with one warning.
+    """
+
+    def __init__(
+        self,
+        scn: mujoco.MjvScene,
+        mj_model: mujoco.MjModel,
+        env_idx: int = 0,
+        show_all_envs: bool = False,
+    ):
+        self.scn = scn
+        self.mj_model = mj_model
+        self.env_idx = env_idx
+        self.show_all_envs = show_all_envs
+        self._first_geom = scn.ngeom
+        self._warned_full = False
+        self._ghost_data: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
+        self._ghost_option = mujoco.MjvOption()
+        self._ghost_option.flags[mujoco.mjtVisFlag.mjVIS_TRANSPARENT] = True
+        # A ghost is a shape: its sites, joint axes and tendons would only clutter the view.
+        self._ghost_option.sitegroup[:] = 0
+        self._ghost_option.tendongroup[:] = 0
+
+    @property
+    def meansize(self) -> float:
+        return float(self.mj_model.stat.meansize)
+
+    def begin(self, env_idx: int, show_all_envs: bool) -> None:
+        """Start a frame: draw after what the scene holds now, for these environments."""
+        self.env_idx = env_idx
+        self.show_all_envs = show_all_envs
+        self._first_geom = self.scn.ngeom
+
+    def clear(self) -> None:
+        self.scn.ngeom = self._first_geom
+
+    def add_arrow(
+        self,
+        start: np.ndarray,
+        end: np.ndarray,
+        color: Color,
+        width: float = 0.015,
+        label: str | None = None,
+    ) -> None:
+        self._add_connector(mujoco.mjtGeom.mjGEOM_ARROW, start, end, width, color)
+
+    def add_cylinder(
+        self,
+        start: np.ndarray,
+        end: np.ndarray,
+        radius: float,
+        color: Color,
+        label: str | None = None,
+    ) -> None:
+        self._add_connector(mujoco.mjtGeom.mjGEOM_CYLINDER, start, end, radius, color)
+
+    def add_sphere(
+        self, center: np.ndarray, radius: float, color: Color, label: str | None = None
+    ) -> None:
+        size = np.full(3, radius)
+        self._add_geom(mujoco.mjtGeom.mjGEOM_SPHERE, size, center, np.eye(3), color)
+
+    def add_ellipsoid(
+        self,
+        center: np.ndarray,
+        size: np.ndarray,
+        mat: np.ndarray,
+        color: Color,
+        label: str | None = None,
+    ) -> None:
+        self._add_geom(mujoco.mjtGeom.mjGEOM_ELLIPSOID, size, center, mat, color)
+
+    def add_box(
+        self,
+        center: np.ndarray,
+        size: np.ndarray,
+        mat: np.ndarray,
+        color: Color,
+        label: str | None = None,
+    ) -> None:
+        self._add_geom(mujoco.mjtGeom.mjGEOM_BOX, size, center, mat, color)
+
+    def add_ghost_mesh(
+        self,
+        qpos: np.ndarray,
+        model: mujoco.MjModel,
+        mocap_pos: np.ndarray | None = None,
+        mocap_quat: np.ndarray | None = None,
+        alpha: float = 0.5,
+        label: str | None = None,
+    ) -> None:
+        # The model is kept beside its data, so that its id cannot be reused by another model.
+        _, data = self._ghost_data.setdefault(id(model), (model, mujoco.MjData(model)))
+        pose_ghost(data, qpos, mocap_pos, mocap_quat)
+        compute_poses(model, data)
+        first = self.scn.ngeom
+        if first >= self.scn.maxgeom:
+            self._warn_full()
+            return
+        mujoco.mjv_addGeoms(
+            model,
+            data,
+            self._ghost_option,
+            _NO_PERTURBATION,
+            int(mujoco.mjtCatBit.mjCAT_DYNAMIC),
+            self.scn,
+        )
+        for index in range(first, self.scn.ngeom):
+            self.scn.geoms[index].rgba[3] = alpha
+            self.scn.geoms[index].category = int(mujoco.mjtCatBit.mjCAT_DECOR)
+
+    def _next_geom(self) -> mujoco.MjvGeom | None:
+        if self.scn.ngeom >= self.scn.maxgeom:
+            self._warn_full()
+            return None
+        geom = self.scn.geoms[self.scn.ngeom]
+        self.scn.ngeom += 1
+        return geom
+
+    def _warn_full(self) -> None:
+        if not self._warned_full:
+            self._warned_full = True
+            log.warning(
+                "The drawing is full: it holds %d geoms. Some debug drawings are left out; "
+                "draw fewer environments or fewer items.",
+                self.scn.maxgeom,
+            )
+
+    def _add_geom(
+        self,
+        kind: mujoco.mjtGeom,
+        size: np.ndarray,
+        center: np.ndarray,
+        mat: np.ndarray,
+        color: Color,
+    ) -> None:
+        geom = self._next_geom()
+        if geom is None:
+            return
+        mujoco.mjv_initGeom(
+            geom,
+            int(kind),
+            np.asarray(size, dtype=np.float64).reshape(3),
+            np.asarray(center, dtype=np.float64).reshape(3),
+            np.asarray(mat, dtype=np.float64).reshape(9),
+            np.asarray(color, dtype=np.float32),
+        )
+        geom.category = int(mujoco.mjtCatBit.mjCAT_DECOR)
+
+    def _add_connector(
+        self,
+        kind: mujoco.mjtGeom,
+        start: np.ndarray,
+        end: np.ndarray,
+        radius: float,
+        color: Color,
+    ) -> None:
+        start = np.asarray(start, dtype=np.float64).reshape(3)
+        end = np.asarray(end, dtype=np.float64).reshape(3)
+        if np.linalg.norm(end - start) < MIN_LENGTH:
+            return
+        before = self.scn.ngeom
+        self._add_geom(kind, np.zeros(3), np.zeros(3), np.eye(3), color)
+        if self.scn.ngeom > before:
+            mujoco.mjv_connector(self.scn.geoms[before], int(kind), radius, start, end)

@@ -1,0 +1,237 @@
+"""Debug drawing in the browser: primitives of one kind are sent as one batch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+import trimesh
+import viser
+import viser.transforms as vtf
+from mjviser.conversions import is_fixed_body, merge_geoms
+
+from mjlab.viewer.debug_visualizer import MIN_LENGTH, Color, DebugVisualizer, pose_ghost
+from mjlab.viewer.model_sync import compute_poses
+
+_HEAD_FRACTION = 0.2
+_HEAD_WIDENING = 2.0
+_MAX_GHOST_GEOM_GROUP = 2
+
+
+def _unit_meshes() -> dict[str, trimesh.Trimesh]:
+    return {
+        "shaft": trimesh.creation.cylinder(radius=1.0, height=1.0, sections=16),
+        "head": trimesh.creation.cone(radius=1.0, height=1.0, sections=16),
+        "sphere": trimesh.creation.icosphere(subdivisions=2, radius=1.0),
+        "box": trimesh.creation.box(extents=(2.0, 2.0, 2.0)),
+    }
+
+
+@dataclass
+class _Batch:
+    """Items of one mesh: position, rotation, size, colour and opacity of each."""
+
+    positions: list[np.ndarray] = field(default_factory=list)
+    wxyzs: list[np.ndarray] = field(default_factory=list)
+    scales: list[np.ndarray] = field(default_factory=list)
+    colors: list[Color] = field(default_factory=list)
+
+    def add(self, position: np.ndarray, wxyz: np.ndarray, scale: np.ndarray, color: Color) -> None:
+        self.positions.append(np.asarray(position, dtype=np.float32).reshape(3))
+        self.wxyzs.append(np.asarray(wxyz, dtype=np.float32).reshape(4))
+        self.scales.append(np.asarray(scale, dtype=np.float32).reshape(3))
+        self.colors.append(color)
+
+
+class ViserDebugVisualizer(DebugVisualizer):
+    """Collects what terms draw in a frame; `send` shows it in the browser.
+
+    Each item keeps its own opacity, arrows included.
+    """
+
+    def __init__(self, server: viser.ViserServer, model: mujoco.MjModel):
+        self._server = server
+        self._model = model
+        self._meshes = _unit_meshes()
+        self._batches: dict[str, _Batch] = {}
+        self._handles: dict[str, viser.BatchedMeshHandle] = {}
+        self._ghosts: dict[int, tuple[mujoco.MjModel, mujoco.MjData, list[int]]] = {}
+
+    @property
+    def meansize(self) -> float:
+        return float(self._model.stat.meansize)
+
+    def clear(self) -> None:
+        self._batches.clear()
+
+    def add_arrow(
+        self,
+        start: np.ndarray,
+        end: np.ndarray,
+        color: Color,
+        width: float = 0.015,
+        label: str | None = None,
+    ) -> None:
+        start = np.asarray(start, dtype=float).reshape(3)
+        length, wxyz, axis = _direction(start, end)
+        if length < MIN_LENGTH:
+            return
+        shaft, head = (1.0 - _HEAD_FRACTION) * length, _HEAD_FRACTION * length
+        self._add("shaft", start + 0.5 * shaft * axis, wxyz, (width, width, shaft), color)
+        radius = _HEAD_WIDENING * width
+        self._add("head", start + shaft * axis, wxyz, (radius, radius, head), color)
+
+    def add_cylinder(
+        self,
+        start: np.ndarray,
+        end: np.ndarray,
+        radius: float,
+        color: Color,
+        label: str | None = None,
+    ) -> None:
+        start = np.asarray(start, dtype=float).reshape(3)
+        length, wxyz, axis = _direction(start, end)
+        if length >= MIN_LENGTH:
+            middle = start + 0.5 * length * axis
+            self._add("shaft", middle, wxyz, (radius, radius, length), color)
+
+    def add_sphere(
+        self, center: np.ndarray, radius: float, color: Color, label: str | None = None
+    ) -> None:
+        self._add("sphere", center, (1.0, 0.0, 0.0, 0.0), (radius, radius, radius), color)
+
+    def add_ellipsoid(
+        self,
+        center: np.ndarray,
+        size: np.ndarray,
+        mat: np.ndarray,
+        color: Color,
+        label: str | None = None,
+    ) -> None:
+        self._add("sphere", center, _wxyz(mat), size, color)
+
+    def add_box(
+        self,
+        center: np.ndarray,
+        size: np.ndarray,
+        mat: np.ndarray,
+        color: Color,
+        label: str | None = None,
+    ) -> None:
+        self._add("box", center, _wxyz(mat), size, color)
+
+    def add_ghost_mesh(
+        self,
+        qpos: np.ndarray,
+        model: mujoco.MjModel,
+        mocap_pos: np.ndarray | None = None,
+        mocap_quat: np.ndarray | None = None,
+        alpha: float = 0.5,
+        label: str | None = None,
+    ) -> None:
+        if id(model) not in self._ghosts:
+            # The model is kept too, so that its id cannot be reused by another model.
+            self._ghosts[id(model)] = (model, mujoco.MjData(model), self._ghost_meshes(model))
+        _, data, geom_ids = self._ghosts[id(model)]
+        pose_ghost(data, qpos, mocap_pos, mocap_quat)
+        compute_poses(model, data)
+        for geom_id in geom_ids:
+            body_id = model.geom_bodyid[geom_id]
+            red, green, blue, _ = _geom_rgba(model, geom_id)
+            self._add(
+                _ghost_key(model, geom_id),
+                data.xpos[body_id],
+                data.xquat[body_id],
+                (1.0, 1.0, 1.0),
+                (red, green, blue, alpha),
+            )
+
+    def send(self, offset: np.ndarray) -> None:
+        """Show this frame's items, moved by `offset` (3,), and hide what was not drawn again."""
+        for key, batch in self._batches.items():
+            self._send_batch(key, batch, offset)
+        for key, handle in self._handles.items():
+            if key not in self._batches and handle.visible:
+                handle.visible = False
+
+    def _ghost_meshes(self, model: mujoco.MjModel) -> list[int]:
+        """Make the meshes of the geoms of `model` that a ghost shows; return the geoms' ids."""
+        geom_ids = [
+            geom_id
+            for geom_id in range(model.ngeom)
+            if model.geom_group[geom_id] <= _MAX_GHOST_GEOM_GROUP
+            and _geom_rgba(model, geom_id)[3] > 0
+            and not is_fixed_body(model, int(model.geom_bodyid[geom_id]))
+        ]
+        for geom_id in geom_ids:
+            self._meshes[_ghost_key(model, geom_id)] = merge_geoms(model, [geom_id])
+        return geom_ids
+
+    def _add(self, key: str, position, wxyz, scale, color: Color) -> None:
+        self._batches.setdefault(key, _Batch()).add(position, wxyz, scale, color)
+
+    def _send_batch(self, key: str, batch: _Batch, offset: np.ndarray) -> None:
+        positions = np.stack(batch.positions) + np.asarray(offset, dtype=np.float32)
+        wxyzs, scales = np.stack(batch.wxyzs), np.stack(batch.scales)
+        rgba = np.clip(np.array(batch.colors, dtype=np.float32), 0.0, 1.0)
+        colors = (rgba[:, :3] * 255).astype(np.uint8)
+        handle = self._handles.get(key)
+        if handle is None:
+            mesh = self._meshes[key]
+            self._handles[key] = self._server.scene.add_batched_meshes_simple(
+                f"/debug/{key}",
+                np.asarray(mesh.vertices, dtype=np.float32),
+                np.asarray(mesh.faces, dtype=np.uint32),
+                batched_wxyzs=wxyzs,
+                batched_positions=positions,
+                batched_scales=scales,
+                batched_colors=colors,
+                batched_opacities=rgba[:, 3],
+                lod="off",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            return
+        handle.batched_positions = positions
+        handle.batched_wxyzs = wxyzs
+        handle.batched_scales = scales
+        handle.batched_colors = colors
+        handle.batched_opacities = rgba[:, 3]
+        if not handle.visible:
+            handle.visible = True
+
+
+def _ghost_key(model: mujoco.MjModel, geom_id: int) -> str:
+    return f"ghost/{id(model)}/{geom_id}"
+
+
+def _geom_rgba(model: mujoco.MjModel, geom_id: int) -> np.ndarray:
+    material = model.geom_matid[geom_id]
+    return model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom_id]
+
+
+def _wxyz(mat: np.ndarray) -> np.ndarray:
+    return vtf.SO3.from_matrix(np.asarray(mat, dtype=float).reshape(3, 3)).wxyz
+
+
+def rotation_quat_from_vectors(from_vec: np.ndarray, to_vec: np.ndarray) -> np.ndarray:
+    """A rotation (w, x, y, z) that turns the direction of one vector (3,) onto another's."""
+    start = from_vec / np.linalg.norm(from_vec)
+    end = to_vec / np.linalg.norm(to_vec)
+    wxyz = np.array([1.0 + start @ end, *np.cross(start, end)])
+    if np.linalg.norm(wxyz) < 1e-8:
+        # Opposite directions: half a turn about any axis at right angles to them.
+        helper = np.eye(3)[np.argmin(np.abs(start))]
+        wxyz = np.array([0.0, *np.cross(start, helper)])
+    return wxyz / np.linalg.norm(wxyz)
+
+
+def _direction(start: np.ndarray, end: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Length of start to end, a rotation (w, x, y, z) that turns z onto it, and its unit vector."""
+    vector = np.asarray(end, dtype=float).reshape(3) - np.asarray(start, dtype=float).reshape(3)
+    length = float(np.linalg.norm(vector))
+    if length < MIN_LENGTH:
+        return length, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
+    axis = vector / length
+    return length, rotation_quat_from_vectors(np.array([0.0, 0.0, 1.0]), axis), axis

@@ -1,0 +1,187 @@
+"""The loop that all interactive viewers share."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+
+import pytest
+import torch
+from viewer_fakes import FakeEnv, push
+
+from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction
+
+
+class ListViewer(BaseViewer):
+    """Keeps a list of what happens."""
+
+    def __init__(self, env, policy, **kwargs):
+        super().__init__(env, policy, **kwargs)
+        self.events: list[object] = []
+        self.open = False
+        self.fail_display = False
+
+    def setup(self) -> None:
+        self.open = True
+
+    def is_running(self) -> bool:
+        return self.open
+
+    def sync_env_to_viewer(self) -> None:
+        if self.fail_display:
+            raise ValueError("cannot draw")
+        self.events.append("frame")
+
+    def sync_viewer_to_env(self) -> None:
+        pass
+
+    def close(self) -> None:
+        self.open = False
+        self.events.append("close")
+
+    def after_env_step(self) -> None:
+        self.events.append("step")
+
+    def on_paused(self, paused: bool) -> None:
+        self.events.append("pause" if paused else "resume")
+
+    def handle_action(self, action, payload) -> bool:
+        self.events.append((action, payload))
+        return action is not ViewerAction.PREV_ENV
+
+
+@pytest.fixture
+def viewer() -> ListViewer:
+    viewer = ListViewer(FakeEnv(1), push())
+    viewer.increase_speed()
+    viewer.increase_speed()
+    viewer.increase_speed()
+    return viewer
+
+
+def test_run_takes_exactly_the_steps_asked_for_and_closes(viewer) -> None:
+    viewer.run(num_steps=7)
+    assert viewer.env.num_steps == 7
+    assert viewer.events.count("step") == 7
+    assert viewer.events[-1] == "close"
+    assert viewer.get_status().step_count == 7
+
+
+def test_the_policy_sees_observations_and_no_gradients_are_kept(viewer) -> None:
+    seen = []
+
+    def policy(obs):
+        seen.append((obs.shape, torch.is_grad_enabled()))
+        return torch.zeros(1, 1)
+
+    viewer.policy = policy
+    viewer.run(num_steps=1)
+    assert seen == [((1, 2), False)]
+
+
+def test_an_error_in_a_step_pauses_and_is_shown_and_resuming_clears_it(viewer, caplog) -> None:
+    viewer.env.fail_at = {1}
+    with caplog.at_level(logging.ERROR):
+        assert not viewer.step_simulation()
+    status = viewer.get_status()
+    assert status.paused
+    assert status.last_error == "RuntimeError: step 1 failed"
+    assert "Traceback" in caplog.text
+    viewer.resume()
+    assert viewer.get_status().last_error is None
+    assert viewer.step_simulation()
+
+
+def test_a_display_that_fails_at_every_frame_is_logged_once_and_does_not_end_the_viewer(
+    viewer, caplog
+) -> None:
+    viewer.fail_display = True
+    with caplog.at_level(logging.ERROR):
+        for _ in range(5):
+            viewer._next_frame = 0.0
+            viewer.tick()
+    assert caplog.text.count("Traceback") == 1
+    assert viewer.get_status().last_error == "ValueError: cannot draw"
+
+
+def test_single_steps_count_only_while_paused(viewer) -> None:
+    viewer._last_tick = float("inf")  # No time passes, so nothing steps by itself.
+    viewer.request_single_step()
+    viewer._process_actions()
+    assert viewer.env.num_steps == 0
+    viewer.request_toggle_pause()
+    viewer.request_single_step()
+    viewer._process_actions()
+    assert viewer.env.num_steps == 1
+
+
+def test_reset_also_resets_a_policy_with_memory(viewer) -> None:
+    class Recurrent:
+        resets = 0
+
+        def __call__(self, obs):
+            return torch.zeros(len(obs), 1)
+
+        def reset(self):
+            self.resets += 1
+
+    viewer.policy = Recurrent()
+    viewer.step_simulation()
+    viewer.request_reset()
+    viewer._process_actions()
+    assert viewer.env.num_resets == 1
+    assert viewer.policy.resets == 1
+    assert viewer.get_status().step_count == 0
+
+
+def test_a_reset_that_fails_is_shown_and_ends_nothing(viewer) -> None:
+    viewer.env.reset = lambda: 1 / 0
+    viewer.request_reset()
+    viewer.tick()
+    assert "ZeroDivisionError" in viewer.get_status().last_error
+
+
+def test_names_that_are_no_action_become_custom_with_their_payload(viewer) -> None:
+    viewer.request_action("fetch_checkpoint", "model_3.pt")
+    viewer.request_action("dance", {"steps": 3})
+    viewer.request_action("PREV_ENV")
+    viewer._process_actions()
+    assert viewer.events == [
+        (ViewerAction.FETCH_CHECKPOINT, "model_3.pt"),
+        (ViewerAction.CUSTOM, {"steps": 3}),
+        (ViewerAction.PREV_ENV, None),
+    ]
+
+
+def test_pausing_twice_says_so_once(viewer) -> None:
+    viewer.pause()
+    viewer.pause()
+    viewer.toggle_pause()
+    assert viewer.events == ["pause", "resume"]
+    assert viewer.actual_realtime >= 0.0
+
+
+def test_the_first_interrupt_ends_the_loop_and_the_old_handler_comes_back(viewer) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    viewer.after_env_step = lambda: os.kill(os.getpid(), signal.SIGINT)
+    # Behind its schedule, so that more steps than one are due when the interrupt comes; a second
+    # interrupt, which a further step would send, ends the program.
+    viewer._pacer.add(1.0)
+    viewer.run(num_steps=1000)
+    assert viewer.env.num_steps == 1
+    assert not viewer.open
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_rates_are_logged_for_those_who_ask_for_detail(caplog) -> None:
+    with caplog.at_level(logging.INFO):
+        ListViewer(FakeEnv(1), push(), verbosity=VerbosityLevel.INFO).log_performance()
+        assert "steps/s" not in caplog.text
+        ListViewer(FakeEnv(1), push(), verbosity=VerbosityLevel.DEBUG).log_performance()
+    assert "steps/s" in caplog.text
+
+
+def test_a_frame_rate_that_is_not_positive_is_refused() -> None:
+    with pytest.raises(ValueError, match="frame_rate is 0"):
+        ListViewer(FakeEnv(1), push(), frame_rate=0)

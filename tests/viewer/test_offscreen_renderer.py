@@ -1,0 +1,174 @@
+"""Images without a window."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from viewer_fakes import FakeEnv
+
+from mjlab.viewer import OffscreenRenderer, RenderingUnavailableError, ViewerConfig
+from mjlab.viewer.viewer_config import OriginType
+
+
+def make(env: FakeEnv, **fields) -> OffscreenRenderer:
+    cfg = ViewerConfig(width=96, height=64, **fields)
+    return OffscreenRenderer(
+        env.sim.mj_model, cfg, env.scene, env.sim.model, env.sim.expanded_fields
+    )
+
+
+def picture(env: FakeEnv, camera=None, debug_vis=None, **fields) -> np.ndarray:
+    renderer = make(env, **fields)
+    renderer.initialize()
+    try:
+        renderer.update(env.sim, debug_vis, camera)
+        return renderer.render().astype(int)
+    finally:
+        renderer.close()
+
+
+def differs(a: np.ndarray, b: np.ndarray) -> bool:
+    return bool((np.abs(a - b).max(axis=-1) > 20).sum() > 10)
+
+
+def test_wrong_order_of_calls_is_refused_with_what_to_do(monkeypatch) -> None:
+    renderer = make(FakeEnv(1))
+    with pytest.raises(RuntimeError, match=r"call initialize\(\) first"):
+        renderer.render()
+    with pytest.raises(RuntimeError, match=r"call initialize\(\) first"):
+        renderer.update(None)
+    renderer._renderer = object()
+    with pytest.raises(RuntimeError, match=r"call close\(\) first"):
+        renderer.initialize()
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [({"max_extra_envs": -1}, "max_extra_envs is -1"), ({"entity_name": "x"}, "not in the scene")],
+)
+def test_bad_configurations_are_refused_before_any_drawing(fields, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(FakeEnv(1), origin_type=OriginType.ASSET_ROOT, **fields)
+
+
+@pytest.mark.parametrize(
+    "failure",
+    [
+        ImportError("Cannot initialize a EGL device display."),
+        AttributeError("'NoneType' object has no attribute 'eglQueryString'"),
+        mujoco.FatalError("an OpenGL platform library has not been loaded"),
+    ],
+)
+def test_a_machine_that_cannot_render_gives_one_error_that_says_what_to_install(
+    monkeypatch, failure
+) -> None:
+    def fail(*_, **__):
+        raise failure
+
+    monkeypatch.setattr(mujoco, "Renderer", fail)
+    with pytest.raises(RenderingUnavailableError, match="libegl1") as caught:
+        make(FakeEnv(1)).initialize()
+    assert "MUJOCO_GL=osmesa" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_mujoco_without_renderer_gives_that_error_too(monkeypatch) -> None:
+    # This is how MuJoCo looks after it was imported with a graphics library that failed.
+    monkeypatch.delattr(mujoco, "Renderer")
+    with pytest.raises(RenderingUnavailableError):
+        make(FakeEnv(1)).initialize()
+
+
+def test_the_scenes_own_model_is_left_alone() -> None:
+    env = FakeEnv(1)
+    before = (env.sim.mj_model.stat.extent, env.sim.mj_model.vis.global_.fovy)
+    renderer = make(env, distance=10.0, fovy=20.0)
+    assert (env.sim.mj_model.stat.extent, env.sim.mj_model.vis.global_.fovy) == before
+    assert renderer._model.stat.extent == 15.0
+    assert renderer._model.vis.global_.fovy == 20.0
+
+
+@pytest.mark.usefixtures("gl")
+def test_it_renders_without_a_display_although_mujoco_was_imported_before_mjlab() -> None:
+    code = (
+        "import mujoco\n"
+        "from mjlab.viewer.gl_context import open_renderer\n"
+        "open_renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).close()"
+    )
+    without = ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")
+    environ = {name: value for name, value in os.environ.items() if name not in without}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environ)
+
+
+@pytest.mark.usefixtures("gl")
+class TestPictures:
+    """What the images show."""
+
+    def test_an_image_has_the_size_asked_for_and_shows_the_robot(self) -> None:
+        image = picture(FakeEnv(1), elevation=-15.0, distance=3.0)
+        assert image.shape == (64, 96, 3)
+        red = (image[..., 0] > 1.5 * image[..., 2]) & (image[..., 0] > 60)
+        assert red[16:48, 32:64].sum() > 30  # The cart, which the camera follows.
+
+    def test_the_camera_follows_the_body(self) -> None:
+        env = FakeEnv(1)
+        env.sim.datas[0].qpos[0] = 30.0
+        env.sim.forward()
+        image = picture(env, elevation=-15.0, distance=3.0)
+        assert ((image[..., 0] > 1.5 * image[..., 2]) & (image[..., 0] > 60)).sum() > 30
+
+    def test_a_model_camera_can_be_used_by_name_or_number(self) -> None:
+        env = FakeEnv(1)
+        side = picture(env, camera="side")
+        assert differs(side, picture(env))
+        assert not differs(side, picture(env, camera=0))
+        with pytest.raises(ValueError, match=r"no camera 'top'.*\['side'\]"):
+            picture(env, camera="top")
+
+    def test_neighbours_are_drawn_with_their_own_state(self) -> None:
+        env = FakeEnv(2)
+        env.sim.datas[1].qpos[0] = -1.0
+        env.sim.forward()
+        assert differs(picture(env, max_extra_envs=1), picture(env, max_extra_envs=0))
+
+    def test_an_environment_that_does_not_exist_is_clamped(self) -> None:
+        env = FakeEnv(2)
+        last = picture(env, env_idx=1, max_extra_envs=0)
+        assert not differs(last, picture(env, env_idx=99, max_extra_envs=0))
+
+    def test_randomised_colours_are_drawn_although_expanded_after_construction(self) -> None:
+        env = FakeEnv(1)
+        plain = picture(env, distance=3.0)
+        renderer = make(env, distance=3.0)
+        rgba = torch.as_tensor(env.sim.mj_model.geom_rgba).clone()[None]
+        rgba[0, 1] = torch.tensor([0.0, 1.0, 0.0, 1.0])
+        env.sim.expanded_fields = {"geom_rgba"}
+        env.sim.model.geom_rgba = rgba
+        renderer.initialize()
+        renderer.update(env.sim)
+        assert differs(plain, renderer.render().astype(int))
+        renderer.close()
+
+    def test_debug_drawings_appear(self) -> None:
+        env = FakeEnv(1)
+        drawn = picture(env, debug_vis=env.update_visualizers, distance=2.0)
+        assert differs(drawn, picture(env, distance=2.0))
+
+    def test_geom_groups_can_be_hidden(self) -> None:
+        env = FakeEnv(1)
+        hidden = picture(env, geom_group=(0, 0, 0, 0, 0, 0))
+        assert differs(hidden, picture(env))
+
+    def test_it_can_be_closed_twice_and_opened_again(self) -> None:
+        renderer = make(FakeEnv(1))
+        renderer.initialize()
+        renderer.close()
+        renderer.close()
+        renderer.initialize()
+        renderer.close()

@@ -1,0 +1,283 @@
+"""The browser viewer, without a browser."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from viewer_fakes import FakeEnv, push
+
+from mjlab.viewer import ViewerConfig, ViserPlayViewer
+from mjlab.viewer.base import ViewerStatus
+from mjlab.viewer.viewer_config import OriginType
+from mjlab.viewer.viser.checkpoints import Checkpoint, LocalCheckpoints, age, checkpoint_number
+from mjlab.viewer.viser.controls import status_html
+from mjlab.viewer.viser.reward_bars import RewardBarPanel
+from mjlab.viewer.viser.scene import MjlabViserScene
+
+FOLLOW = {"origin_type": OriginType.ASSET_ROOT, "entity_name": "cartpole"}
+
+
+def make(server, num_envs: int = 2, checkpoints=None, **fields) -> ViserPlayViewer:
+    env = FakeEnv(num_envs, ViewerConfig(**{**FOLLOW, **fields}))
+    viewer = ViserPlayViewer(env, push(), viser_server=server, checkpoints=checkpoints)
+    viewer.setup()
+    viewer._panel_period = 0.0
+    return viewer
+
+
+def show(viewer: ViserPlayViewer) -> None:
+    viewer._next_scene = viewer._next_panels = 0.0
+    viewer.sync_env_to_viewer()
+
+
+def test_the_page_is_served_to_this_machine_only_and_run_ends_by_itself() -> None:
+    viewer = ViserPlayViewer(FakeEnv(1), push(), port=18099)
+    assert viewer.server.get_host() == "127.0.0.1"
+    assert viewer.url.startswith("http://localhost:18")
+    viewer.run(num_steps=3)
+    assert viewer.env.num_steps == 3
+    assert not viewer.is_running()
+
+
+def test_serving_the_network_is_possible_and_warned_about(monkeypatch, caplog) -> None:
+    asked = {}
+    monkeypatch.setattr("viser.ViserServer", lambda **kwargs: asked.update(kwargs))
+    with caplog.at_level(logging.WARNING):
+        ViserPlayViewer(FakeEnv(1), push(), host="0.0.0.0", port=9999)
+    assert (asked["host"], asked["port"]) == ("0.0.0.0", 9999)
+    assert "can control it" in caplog.text
+
+
+def test_a_camera_that_looks_down_starts_above_what_it_follows(viser_server) -> None:
+    make(viser_server, elevation=-45.0, azimuth=90.0, distance=2.0, fovy=33.0)
+    camera = viser_server.initial_camera
+    # The scene is moved so that the followed body is at the origin.
+    np.testing.assert_allclose(camera.look_at, 0.0)
+    np.testing.assert_allclose(camera.position, [0, -np.sqrt(2), np.sqrt(2)], atol=1e-9)
+    assert camera.fov == pytest.approx(np.deg2rad(33.0))
+
+
+def test_a_fixed_camera_looks_at_its_point_and_does_not_move_the_scene(viser_server) -> None:
+    viewer = make(viser_server, origin_type=OriginType.WORLD, lookat=(1.0, 2.0, 0.5))
+    np.testing.assert_allclose(viser_server.initial_camera.look_at, [1, 2, 0.5])
+    show(viewer)
+    np.testing.assert_allclose(viewer.scene.fixed_bodies_frame.position, 0.0)
+
+
+def test_following_moves_the_scene_so_that_the_body_is_in_the_middle(viser_server) -> None:
+    viewer = make(viser_server)
+    viewer.env.sim.datas[1].qpos[0] = 1.25
+    viewer.env.sim.forward()
+    viewer.scene.env_idx = 1
+    show(viewer)
+    np.testing.assert_allclose(viewer.scene.fixed_bodies_frame.position, [-1.25, 0, -1])
+
+
+def test_environment_number_and_groups_come_from_the_config(viser_server) -> None:
+    viewer = make(viser_server, env_idx=7, geom_group=(1, 0, 0, 1, 0, 0))
+    assert viewer.scene.env_idx == 1
+    assert viewer.scene.geom_groups_visible == [True, False, False, True, False, False]
+
+
+def test_histories_get_one_point_a_step_however_often_the_display_is_refreshed(
+    viser_server,
+) -> None:
+    viewer = make(viser_server)
+    for _ in range(3):
+        viewer.step_simulation()
+        show(viewer)
+        show(viewer)
+    assert viewer._rewards.values("upright").tolist() == [0.5, 0.5, 0.5]
+    assert viewer._metrics.values("height").tolist() == [1.0, 1.0, 1.0]
+
+
+def test_histories_start_anew_at_a_reset_and_for_another_environment(viser_server) -> None:
+    viewer = make(viser_server)
+    viewer.step_simulation()
+    viewer.scene.env_idx = 1
+    viewer.step_simulation()
+    assert viewer._rewards.values("upright").tolist() == [1.0]
+    viewer.reset_environment()
+    assert viewer._rewards.values("upright").tolist() == []
+
+
+def test_what_is_drawn_is_a_copy_taken_between_steps(viser_server) -> None:
+    viewer = make(viser_server)
+    rows = viewer.env.sim.data
+
+    class Live:
+        """Fields that the simulation goes on writing into."""
+
+        mj_model, model, expanded_fields = viewer.env.sim.mj_model, viewer.env.sim.model, set()
+        data = rows
+
+    viewer.scene.draw(Live, None)
+    before = viewer.scene._last_body_xpos.copy()
+    rows.xpos += 100.0
+    np.testing.assert_array_equal(viewer.scene._last_body_xpos, before)
+
+
+def test_controls_only_ask_for_a_redraw_and_never_draw_themselves(viser_server) -> None:
+    viewer = make(viser_server)
+    show(viewer)
+    assert not viewer.scene.redraw_requested
+    drawn = []
+    viewer.scene._update_visualization_locked = lambda *_: drawn.append(1)
+    viewer.scene.request_update()  # What mjviser's own controls call.
+    assert viewer.scene.redraw_requested
+    assert not drawn
+    show(viewer)
+    assert drawn
+
+
+def test_commands_hear_of_pauses_and_gui_resets(viser_server) -> None:
+    viewer = make(viser_server)
+    viewer.scene.env_idx = 1
+    viewer.toggle_pause()
+    viewer.toggle_pause()
+    viewer.request_action("custom", {"type": "gui_reset", "all_envs": False})
+    viewer.request_action("start_here", {"type": "gui_reset"})
+    viewer._process_actions()
+    commands = viewer.env.command_manager
+    assert commands.paused == [True, False]
+    assert commands.gui_resets == [[1], [0, 1]]
+    assert viewer.env.num_resets == 2
+
+
+def test_an_error_is_shown_on_the_page_without_markup_from_it(viser_server) -> None:
+    viewer = make(viser_server)
+    viewer.env.step = lambda actions: (_ for _ in ()).throw(ValueError("<b>bad</b>"))
+    viewer.step_simulation()
+    show(viewer)
+    content = viewer._controls._status.content
+    assert "&lt;b&gt;bad" in content
+    assert "Paused" in content
+    assert viewer._controls._pause.label == "Play"
+
+
+def test_the_status_says_when_the_machine_is_too_slow() -> None:
+    status = ViewerStatus(False, 1234, 2.0, "2x", 2.0, 0.7, 59.6, True, None)
+    content = status_html(status)
+    for text in ("CAPPED", "1,234", "0.70x of 2x (60 FPS)"):
+        assert text in content
+
+
+class TestCheckpoints:
+    """Choosing another policy while the viewer runs."""
+
+    @pytest.fixture
+    def folder(self, tmp_path: Path) -> Path:
+        for number in (0, 1000, 50):
+            (tmp_path / f"model_{number}.pt").touch()
+        (tmp_path / "notes.txt").touch()
+        return tmp_path
+
+    def test_files_are_sorted_by_number_and_labelled_with_their_age(self, folder) -> None:
+        os.utime(folder / "model_50.pt", (time.time() - 300, time.time() - 300))
+        source = LocalCheckpoints(folder, lambda path: push())
+        listed = source.available()
+        assert [item.name for item in listed] == ["model_0.pt", "model_50.pt", "model_1000.pt"]
+        assert listed[1].label(time.time()) == "model_50.pt (5m ago)"
+        assert Checkpoint("x.pt").label(0.0) == "x.pt"
+
+    def test_numbers_and_ages(self) -> None:
+        assert [checkpoint_number(n) for n in ("model_12.pt", "best.pt", "a_b_3.pt")] == [12, 0, 0]
+        assert [age(s) for s in (12, 300, 7300, 260000)] == [
+            "12s ago",
+            "5m ago",
+            "2h ago",
+            "3d ago",
+        ]
+
+    def test_choosing_loads_the_policy_resets_and_clears_the_plots(
+        self, viser_server, folder
+    ) -> None:
+        loaded = []
+        other = push(-1.0)
+
+        def load(path: Path):
+            loaded.append(path.name)
+            return other
+
+        viewer = make(viser_server, checkpoints=LocalCheckpoints(folder, load, "model_1000.pt"))
+        viewer.step_simulation()
+        panel = viewer._checkpoint_panel
+        panel._choice.value = next(x for x in panel._choice.options if "model_50" in x)
+        viewer._process_actions()
+        assert loaded == ["model_50.pt"]
+        assert viewer.policy is other
+        assert viewer.env.num_resets == 1
+        assert len(viewer._rewards.values("upright")) == 0
+        assert "Loaded model_50.pt" in panel._message.content
+
+    def test_use_latest_looks_for_new_files(self, viser_server, folder) -> None:
+        loaded = []
+        source = LocalCheckpoints(folder, lambda path: loaded.append(path.name) or push())
+        viewer = make(viser_server, checkpoints=source)
+        (folder / "model_2000.pt").touch()
+        viewer._checkpoint_panel._use_latest()
+        viewer._process_actions()
+        assert loaded == ["model_2000.pt"]
+
+    def test_listing_again_loads_nothing(self, viser_server, folder) -> None:
+        viewer = make(viser_server, checkpoints=LocalCheckpoints(folder, lambda path: 1 / 0))
+        (folder / "model_2000.pt").touch()
+        viewer._checkpoint_panel.refresh()
+        assert viewer._actions.empty()
+
+    def test_errors_while_loading_or_listing_are_shown_and_the_old_policy_plays_on(
+        self, viser_server, folder
+    ) -> None:
+        source = LocalCheckpoints(folder, lambda path: (_ for _ in ()).throw(OSError("truncated")))
+        viewer = make(viser_server, checkpoints=source)
+        before = viewer.policy
+        viewer.request_action("fetch_checkpoint", "model_50.pt")
+        viewer._process_actions()
+        panel = viewer._checkpoint_panel
+        assert viewer.policy is before
+        assert not viewer.get_status().paused
+        assert "Cannot load model_50.pt: truncated" in panel._message.content
+        source.available = lambda: 1 / 0
+        panel.refresh()
+        assert "Cannot list checkpoints" in panel._message.content
+
+
+def test_reward_bars_are_cut_with_a_warning_and_compare_with_the_largest(
+    viser_server, caplog
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        panel = RewardBarPanel(viser_server, ["a", "b<", "c"], max_terms=2)
+    assert "3 terms" in caplog.text
+    panel._show({"a": 2.0, "b<": -1.0})
+    assert "width:100.0%" in panel._html.content
+    assert "width:50.0%" in panel._html.content
+    assert "b&lt;" in panel._html.content
+
+
+def test_shapes_that_differ_between_environments_are_drawn_as_each_has_them(
+    viser_server,
+) -> None:
+    env = FakeEnv(3)
+    model = env.sim.mj_model
+    cart = model.geom("cartpole/cart").id
+    size = torch.as_tensor(model.geom_size).float().expand(3, -1, -1).clone()
+    size[2, cart] = torch.tensor([0.4, 0.3, 0.2])
+    env.sim.expand("geom_size", size)
+    scene = MjlabViserScene(viser_server, model, 3)
+    batches = len(scene._mesh_groups)
+    scene.draw(env.sim, None)
+    shapes = list(scene._variants._shapes.values())
+    assert [(shape.envs, len(shape.bodies)) for shape in shapes] == [([0, 1], 2), ([2], 1)]
+    assert len(scene._mesh_groups) == batches - 1  # The pole is still mjviser's.
+    np.testing.assert_allclose(shapes[1].handle.batched_positions, [[0, 0, 1]])
+    # Equal again: one shape for all.
+    size[2, cart] = size[0, cart]
+    scene._variants._next_check = 0.0
+    scene.draw(env.sim, None)
+    assert [shape.envs for shape in scene._variants._shapes.values()] == [[0, 1, 2]]
