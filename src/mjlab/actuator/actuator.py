@@ -1,0 +1,348 @@
+"""What all actuators share: config, command, delay, and the life of an actuator.
+
+An `Actuator` object stands for one `ActuatorCfg` of an entity, and so for all joints, tendons or
+sites (its *targets*) that the config's patterns match. It adds MuJoCo actuators (*elements*) to the
+spec, and in every physics substep turns the entity's commands into their controls.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+
+import mujoco
+import torch
+
+from mjlab.actuator._columns import EnvIds, write_columns
+from mjlab.actuator._delay import delay_command as delay_command
+from mjlab.actuator._delay import delay_rows
+from mjlab.actuator.command import ActuatorCmd as ActuatorCmd
+from mjlab.actuator.command import TransmissionType as TransmissionType
+from mjlab.actuator.command import read_command
+from mjlab.utils.buffers import DelayBuffer
+from mjlab.utils.state import stateful
+from mjlab.utils.substep import is_constant_within_step
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity, EntityData
+
+
+@dataclass(kw_only=True)
+class ActuatorCfg(ABC):
+    """What every actuator config has. Delays count physics substeps.
+
+    Raises `ValueError`, when it is made and again when the actuator is built, for figures that make
+    no sense.
+    """
+
+    target_names_expr: tuple[str, ...]
+    """Regular expressions for the names of the targets; each must match a whole name."""
+    transmission_type: TransmissionType = TransmissionType.JOINT
+    """Whether the targets are joints, tendons or sites."""
+    armature: float | None = None
+    """Reflected rotor inertia written to the targets (kg m^2, or kg); None keeps theirs."""
+    frictionloss: float | None = None
+    """Dry friction written to the targets (N m, or N); None keeps theirs."""
+    viscous_damping: float | None = None
+    """Passive linear damping written to the targets (N m s/rad, or N s/m); None keeps theirs."""
+    delay_min_lag: int = 0
+    """Smallest delay of a command, in physics substeps."""
+    delay_max_lag: int = 0
+    """Largest delay of a command, in physics substeps; 0 for none."""
+    delay_hold_prob: float = 0.0
+    """Probability to keep the old lag when a new one would be drawn."""
+    delay_update_period: int = 0
+    """Substeps between draws of the lag; 0 draws at every substep."""
+    delay_per_env_phase: bool = True
+    """Whether environments draw their lags at different substeps of the period."""
+
+    # Kinds that read a position or velocity cannot act on a site, which has none.
+    _accepts_site: ClassVar[bool] = True
+    # Fields that must be above 0 where they are not None.
+    _positive: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        if isinstance(self.target_names_expr, str):
+            raise ValueError(
+                f"{type(self).__name__}.target_names_expr is the string "
+                f"{self.target_names_expr!r}; give a tuple of patterns, "
+                f"({self.target_names_expr!r},)."
+            )
+        if self.transmission_type in list(TransmissionType):
+            # Configs may also say "joint".
+            self.transmission_type = TransmissionType(self.transmission_type)
+        self.validate()
+
+    def validate(self) -> None:
+        """Check the figures; see the class. Subclasses extend it."""
+        if self.transmission_type not in list(TransmissionType):
+            self._refuse("transmission_type", "choose joint, tendon or site")
+        self._validate_target_properties()
+        self._validate_delay()
+        for name in self._positive:
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                self._refuse(name, "it must be positive")
+
+    @abstractmethod
+    def build(self, entity: Entity, target_ids: list[int], target_names: list[str]) -> Actuator:
+        """Return the actuator for these targets (indices and names within the entity)."""
+
+    def _validate_target_properties(self) -> None:
+        on_site = self.transmission_type == TransmissionType.SITE
+        if on_site and not self._accepts_site:
+            self._refuse(
+                "transmission_type", "a site has no position or velocity to control; use a "
+                "joint or a tendon, or BuiltinMotorActuatorCfg or IdealPdActuatorCfg"
+            )  # fmt: skip
+        for name in ("armature", "frictionloss", "viscous_damping"):
+            value = getattr(self, name)
+            if value is not None and not value >= 0.0:
+                self._refuse(name, "it must be at least 0, or None to keep the target's own")
+            if value and on_site:
+                self._refuse(name, "a site has no such property; leave it None")
+
+    def _validate_delay(self) -> None:
+        if self.delay_min_lag < 0:
+            self._refuse("delay_min_lag", "a lag is a number of substeps, at least 0")
+        if self.delay_max_lag < self.delay_min_lag:
+            self._refuse("delay_max_lag", f"it is below delay_min_lag={self.delay_min_lag}")
+        if not 0.0 <= self.delay_hold_prob <= 1.0:
+            self._refuse("delay_hold_prob", "a probability is between 0 and 1")
+        if self.delay_update_period < 0:
+            self._refuse("delay_update_period", "it is a number of substeps; 0 draws at each")
+
+    def _refuse(self, field: str, why: str) -> None:
+        raise ValueError(
+            f"{type(self).__name__} for {self.target_names_expr}: "
+            f"{field}={getattr(self, field)!r}: {why}."
+        )
+
+
+ActuatorCfgT = TypeVar("ActuatorCfgT", bound=ActuatorCfg)
+
+
+@stateful
+class Actuator(ABC, Generic[ActuatorCfgT]):
+    """Turns commands for its targets into controls of MuJoCo actuators.
+
+    To write your own: in `edit_spec` add one element a target and append it to
+    `self._mjs_actuators`, and in `compute` return the controls, (N, number of elements). Keep what
+    changes at run time in tensor attributes, so that a resumed run finds it again. A `compute` that
+    remembers earlier calls also overrides `compute_after_reset`.
+    """
+
+    _transient = {
+        "cfg", "entity", "_mjs_actuators", "_target_ids_list", "_target_names", "_target_ids",
+        "_ctrl_ids", "_global_ctrl_ids", "_in_group", "_resets_delay",
+    }  # fmt: skip
+
+    def __init__(
+        self,
+        cfg: ActuatorCfgT,
+        entity: Entity,
+        target_ids: list[int],
+        target_names: list[str],
+    ) -> None:
+        """Store what the actuator is for. `target_ids` and `target_names` are the entity's."""
+        # A config may have been changed since it was made.
+        cfg.validate()
+        self.cfg = cfg
+        self.entity = entity
+        self._target_ids_list = list(target_ids)
+        self._target_names = list(target_names)
+        self._mjs_actuators: list[mujoco.MjsActuator] = []
+        self._target_ids: torch.Tensor | None = None
+        self._ctrl_ids: torch.Tensor | None = None
+        self._global_ctrl_ids: torch.Tensor | None = None
+        self._delay_buffer: DelayBuffer | None = None
+        self._in_group = False
+        self._resets_delay = True
+
+    # What it acts on.
+
+    @property
+    def target_names(self) -> list[str]:
+        """Names of the targets within the entity."""
+        return self._target_names
+
+    @property
+    def transmission_type(self) -> TransmissionType:
+        """Whether the targets are joints, tendons or sites."""
+        return self.cfg.transmission_type
+
+    @property
+    def target_ids(self) -> torch.Tensor:
+        """(n,) int64 indices of the targets within the entity. Set by `initialize`."""
+        return self._initialized(self._target_ids)
+
+    @property
+    def ctrl_ids(self) -> torch.Tensor:
+        """(number of elements,) int64 indices within the entity's actuators."""
+        return self._initialized(self._ctrl_ids)
+
+    @property
+    def global_ctrl_ids(self) -> torch.Tensor:
+        """(number of elements,) int64 columns of `ctrl` in the simulation."""
+        return self._initialized(self._global_ctrl_ids)
+
+    @property
+    def has_delay(self) -> bool:
+        """Whether commands are delayed."""
+        return self.cfg.delay_max_lag > 0
+
+    @property
+    def needs_substep(self) -> bool:
+        """Whether it has to act at every physics substep, not just once per environment step."""
+        overrides_update = type(self).update is not Actuator.update
+        return self.has_delay or overrides_update or not is_constant_within_step(type(self).compute)
+
+    # Building.
+
+    @abstractmethod
+    def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
+        """Add the elements for `target_names`, names in `spec`, to it.
+
+        Called once with all targets, or, where the entity sorts its actuators, once for each.
+        """
+
+    def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
+        """Find ids in the compiled model and allocate for `data.nworld` environments.
+
+        Args:
+            mj_model: The compiled model.
+            model: The simulation's model fields.
+            data: The simulation's data fields.
+            device: Where tensors live.
+
+        Raises:
+            RuntimeError: `edit_spec` added no elements.
+        """
+        elements = self._ordered_elements()
+        if not elements:
+            raise RuntimeError(
+                f"{type(self).__name__} for {self._target_names} has no MuJoCo actuators: its "
+                "edit_spec must append what it adds to self._mjs_actuators, and run before the "
+                "model is compiled."
+            )
+        # Actuators without a name can only be found by their place in the spec.
+        local_ids = {actuator.id: k for k, actuator in enumerate(self.entity.spec.actuators)}
+        global_ids = [actuator.id for actuator in elements]
+        self._target_ids = _int_tensor(self._target_ids_list, device)
+        self._global_ctrl_ids = _int_tensor(global_ids, device)
+        self._ctrl_ids = _int_tensor([local_ids[i] for i in global_ids], device)
+        self._in_group, self._resets_delay, self._delay_buffer = False, True, None
+        if self.has_delay:
+            self._delay_buffer = self.make_delay_buffer(data.nworld, device)
+
+    def make_delay_buffer(self, num_envs: int, device: str) -> DelayBuffer:
+        """Return a new delay line with the config's settings."""
+        cfg = self.cfg
+        return DelayBuffer(
+            min_lag=cfg.delay_min_lag,
+            max_lag=cfg.delay_max_lag,
+            batch_size=num_envs,
+            device=device,
+            hold_prob=cfg.delay_hold_prob,
+            update_period=cfg.delay_update_period,
+            per_env_phase=cfg.delay_per_env_phase,
+        )
+
+    def join_group(self, delay_buffer: DelayBuffer | None, resets_delay: bool) -> None:
+        """Leave writing controls, and the delay, to a group of actuators.
+
+        Exactly one of the actuators that share a line resets it.
+        """
+        self._in_group = True
+        self._resets_delay = resets_delay
+        self._delay_buffer = delay_buffer
+
+    def _ordered_elements(self) -> list[mujoco.MjsActuator]:
+        """Return the elements in the order of the columns that `compute` returns."""
+        return self._mjs_actuators
+
+    # Acting.
+
+    def get_command(self, data: EntityData) -> ActuatorCmd:
+        """Return copies of the commands and the feedback of the targets, (N, n) each."""
+        return read_command(data, self.transmission_type, self.target_ids)
+
+    def apply_delay(self, cmd: ActuatorCmd) -> ActuatorCmd:
+        """Append the command to the delay line and return the delayed one; feedback stays.
+
+        Raises:
+            RuntimeError: a group runs this actuator's delay line, which a second call would spoil.
+        """
+        return self._delayed(cmd, None)
+
+    @abstractmethod
+    def compute(self, cmd: ActuatorCmd) -> torch.Tensor:
+        """Return the controls of the elements, (N, number of elements)."""
+
+    def compute_after_reset(self, cmd: ActuatorCmd, env_ids: torch.Tensor | slice) -> torch.Tensor:
+        """As `compute`, but only the rows `env_ids`, which were just reset, are of interest.
+
+        A `compute` that changes state must override this and change only the state of `env_ids`.
+        """
+        return self.compute(cmd)
+
+    @staticmethod
+    def control_law(params: dict[str, torch.Tensor], cmd: ActuatorCmd) -> torch.Tensor:
+        """Return the controls as a function of parameters and command alone.
+
+        Only kinds that can be evaluated together have one; see `FusedActuatorGroup`.
+        """
+        raise NotImplementedError("This kind of actuator has only `compute`, no control law.")
+
+    def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
+        """Compute the controls of this actuator and write them to the simulation.
+
+        With `env_ids`, which must just have been reset, nothing of any other environment changes.
+        """
+        if env_ids is None:
+            ctrl = self.compute(self.apply_delay(self.get_command(data)))
+        else:
+            ctrl = self.compute_after_reset(self._delayed(self.get_command(data), env_ids), env_ids)
+        write_columns(data.data.ctrl, self.global_ctrl_ids, ctrl, env_ids)
+
+    def update(self, dt: float) -> None:
+        """Called after every substep of `dt` seconds. Overriding it makes it run in each."""
+
+    def reset(self, env_ids: EnvIds = None) -> None:
+        """Forget the past of these environments: the delay line starts anew with a new lag."""
+        if self._delay_buffer is not None and self._resets_delay:
+            self._delay_buffer.reset(env_ids)
+
+    def set_lags(self, lags: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Set the lags, (k,) integers, of environments until the next draw.
+
+        They are clamped to the configured range. Actuators of one delay line share the lag.
+        Without a configured delay the range is 0 to 0, so nothing changes.
+        """
+        if self._delay_buffer is not None:
+            self._delay_buffer.set_lags(lags, env_ids)
+
+    def _delayed(self, cmd: ActuatorCmd, env_ids: EnvIds) -> ActuatorCmd:
+        if self._delay_buffer is None:
+            return cmd
+        if self._in_group:
+            raise RuntimeError(
+                f"The delay of {type(self).__name__} for {self._target_names} is run by its group, "
+                "together with that of like actuators. Write controls through "
+                "Entity.write_data_to_sim()."
+            )
+        targets = (cmd.position_target, cmd.velocity_target, cmd.effort_target)
+        return ActuatorCmd(*delay_rows(self._delay_buffer, targets, env_ids), cmd.pos, cmd.vel)
+
+    def _initialized(self, value: torch.Tensor | None) -> torch.Tensor:
+        if value is None:
+            raise RuntimeError(
+                f"{type(self).__name__} for {self._target_names} is not initialized yet. Its ids "
+                "are known after Scene.initialize()."
+            )
+        return value
+
+
+def _int_tensor(values: list[int], device: str) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.int64, device=device)

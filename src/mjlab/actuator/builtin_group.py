@@ -1,0 +1,160 @@
+"""Writing the controls of all actuators that only pass commands through, as few as possible."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeGuard
+
+from mjlab.actuator._columns import (
+    Columns,
+    EnvIds,
+    as_columns,
+    read_columns,
+    write_columns,
+)
+from mjlab.actuator._delay import delay_rows
+from mjlab.actuator.actuator import Actuator
+from mjlab.actuator.command import target_field
+from mjlab.actuator.direct import DirectActuator
+from mjlab.utils.buffers import DelayBuffer
+
+if TYPE_CHECKING:
+    from mjlab.entity import EntityData
+
+# What a subclass must not have changed, for its actuators to be written by a group.
+_METHODS = ("compute", "compute_after_reset", "get_command", "apply_delay", "apply_controls")
+
+
+@dataclass
+class _Route:
+    """Targets that go to controls: columns `source` of a target field to columns `ctrl`."""
+
+    field: str
+    source: Columns
+    ctrl: Columns
+
+
+@dataclass
+class _DelayedRoutes:
+    """Routes whose commands are delayed together."""
+
+    routes: list[_Route]
+    line: DelayBuffer
+
+
+@dataclass
+class BuiltinActuatorGroup:
+    """All actuators of an entity whose control is a command, passed through.
+
+    Those without delay make one copy for each target field they read. Those with a delay that may
+    share one (`DirectActuator.shares_delay`) have one delay line, and one lag in each environment,
+    for all with the same class, transmission and delay settings; others have one each.
+
+    An actuator whose class has a `compute` of its own is left to it.
+    """
+
+    _actuators: list[DirectActuator] = field(default_factory=list)
+    _routes: list[_Route] = field(default_factory=list)
+    _delayed_groups: list[_DelayedRoutes] = field(default_factory=list)
+
+    @staticmethod
+    def process(
+        actuators: Sequence[Actuator],
+    ) -> tuple[BuiltinActuatorGroup, tuple[Actuator, ...]]:
+        """Return a group of the actuators that need nothing computed, and all others in order."""
+        members = [actuator for actuator in actuators if _passes_commands(actuator)]
+        others = tuple(actuator for actuator in actuators if not _passes_commands(actuator))
+        return BuiltinActuatorGroup(_actuators=members), others
+
+    def initialize(self, num_envs: int, device: str) -> None:
+        """Plan the copies and make the delay lines. The actuators must be initialized already."""
+        direct = [actuator for actuator in self._actuators if not actuator.has_delay]
+        for actuator in direct:
+            actuator.join_group(None, resets_delay=False)
+        self._routes = _plan(direct, device)
+        self._delayed_groups = [
+            _DelayedRoutes(_plan(members, device), share_line(members, num_envs, device))
+            for members in _by_line(self._actuators).values()
+        ]
+
+    def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
+        """Write the controls of all actuators of the group.
+
+        With `env_ids`, which must just have been reset, nothing of any other environment changes.
+        """
+        if not self._actuators:
+            return
+        ctrl = data.data.ctrl
+        for route in self._routes:
+            write_columns(
+                ctrl, route.ctrl, read_columns(getattr(data, route.field), route.source), env_ids
+            )
+        for group in self._delayed_groups:
+            commands = tuple(
+                read_columns(getattr(data, route.field), route.source) for route in group.routes
+            )
+            delayed = delay_rows(group.line, commands, env_ids)
+            for route, command in zip(group.routes, delayed, strict=True):
+                write_columns(ctrl, route.ctrl, command, env_ids)
+
+
+def delay_settings(actuator: Actuator) -> tuple[Any, ...]:
+    """Return what has to agree for actuators to share a delay line."""
+    cfg = actuator.cfg
+    return (
+        type(actuator),
+        actuator.transmission_type,
+        cfg.delay_min_lag,
+        cfg.delay_max_lag,
+        cfg.delay_hold_prob,
+        cfg.delay_update_period,
+        cfg.delay_per_env_phase,
+    )
+
+
+def share_line(members: Sequence[Actuator], num_envs: int, device: str) -> DelayBuffer:
+    """Make one delay line for actuators with equal settings, and have the first one reset it."""
+    line = members[0].make_delay_buffer(num_envs, device)
+    for k, actuator in enumerate(members):
+        actuator.join_group(line, resets_delay=k == 0)
+    return line
+
+
+def _passes_commands(actuator: Actuator) -> TypeGuard[DirectActuator]:
+    if not isinstance(actuator, DirectActuator):
+        return False
+    unchanged = all(
+        getattr(type(actuator), name) is getattr(DirectActuator, name) for name in _METHODS
+    )
+    # A site has no position or velocity target; where one is asked for, `compute` gives zeros.
+    targets = [target_field(actuator.transmission_type, name) for name in actuator.command_fields]
+    return unchanged and None not in targets
+
+
+def _by_line(actuators: Sequence[DirectActuator]) -> dict[Any, list[DirectActuator]]:
+    lines: dict[Any, list[DirectActuator]] = {}
+    for actuator in actuators:
+        if actuator.has_delay:
+            own = None if actuator.shares_delay else id(actuator)
+            lines.setdefault((delay_settings(actuator), own), []).append(actuator)
+    return lines
+
+
+def _plan(actuators: Sequence[DirectActuator], device: str) -> list[_Route]:
+    """Merge what the actuators read into one route for each target field."""
+    pairs: dict[str, list[tuple[int, int]]] = {}
+    for actuator in actuators:
+        sources = actuator.target_ids.tolist()
+        ctrl_blocks = actuator.global_ctrl_ids.reshape(-1, len(sources)).tolist()
+        for command, ctrl_ids in zip(actuator.command_fields, ctrl_blocks, strict=True):
+            name = target_field(actuator.transmission_type, command)
+            assert name is not None
+            pairs.setdefault(name, []).extend(zip(ctrl_ids, sources, strict=True))
+    routes = []
+    for name, both in pairs.items():
+        # In the order of controls, these are usually neighbours, and often the targets too.
+        both.sort()
+        ctrl_ids, sources = [ctrl for ctrl, _ in both], [source for _, source in both]
+        routes.append(_Route(name, as_columns(sources, device), as_columns(ctrl_ids, device)))
+    return routes

@@ -1,0 +1,106 @@
+"""PD control through a motor whose torque falls with speed."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+
+import torch
+
+from mjlab.actuator.actuator import ActuatorCmd
+from mjlab.actuator.pd_actuator import IdealPdActuator, IdealPdActuatorCfg, pd_torque
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from mjlab.entity import Entity
+
+
+@dataclass(kw_only=True)
+class DcMotorActuatorCfg(IdealPdActuatorCfg):
+    """PD control with a torque-speed curve, see `DcMotorActuator`."""
+
+    saturation_effort: float
+    """Torque at standstill S (N m or N)."""
+    velocity_limit: float
+    """Speed without load w (rad/s or m/s)."""
+
+    _positive: ClassVar[tuple[str, ...]] = (
+        "effort_limit", "saturation_effort", "velocity_limit",
+    )  # fmt: skip
+
+    def build(
+        self, entity: Entity, target_ids: list[int], target_names: list[str]
+    ) -> DcMotorActuator:
+        """See `ActuatorCfg`."""
+        return DcMotorActuator(self, entity, target_ids, target_names)
+
+
+DcMotorCfgT = TypeVar("DcMotorCfgT", bound=DcMotorActuatorCfg)
+
+
+def dc_motor_clip(
+    effort: torch.Tensor,
+    saturation_effort: torch.Tensor,
+    velocity_limit: torch.Tensor,
+    force_limit: torch.Tensor,
+    vel: torch.Tensor,
+) -> torch.Tensor:
+    """Return `effort` clamped to what a motor gives at speed `vel`; all (N, n).
+
+    With S = saturation_effort, w = velocity_limit, F = force_limit and v = vel, the bounds are
+    S (1 - v / w) above and S (-1 - v / w) below, both brought into [-F, F]. Faster than w the upper
+    bound is negative: the motor brakes.
+    """
+    speed = vel / velocity_limit
+    upper = torch.clamp(saturation_effort * (1.0 - speed), -force_limit, force_limit)
+    lower = torch.clamp(saturation_effort * (-1.0 - speed), -force_limit, force_limit)
+    return torch.clamp(effort, lower, upper)
+
+
+class DcMotorActuator(IdealPdActuator[DcMotorCfgT], Generic[DcMotorCfgT]):
+    """The force of `IdealPdActuator`, clamped by `dc_motor_clip` instead of by the limit alone.
+
+    `saturation_effort` and `velocity_limit` are tensors (N, n) too.
+    """
+
+    param_names: ClassVar[tuple[str, ...]] = (
+        *IdealPdActuator.param_names, "saturation_effort", "velocity_limit",
+    )  # fmt: skip
+
+    saturation_effort: torch.Tensor
+    velocity_limit: torch.Tensor
+
+    def __init__(
+        self, cfg: DcMotorCfgT, entity: Entity, target_ids: list[int], target_names: list[str]
+    ) -> None:
+        """See `Actuator`. Warns about an effort limit that leaves the curve without effect."""
+        super().__init__(cfg, entity, target_ids, target_names)
+        if math.isinf(cfg.effort_limit) or cfg.effort_limit > cfg.saturation_effort:
+            warnings.warn(
+                f"{type(cfg).__name__} for {cfg.target_names_expr}: effort_limit="
+                f"{cfg.effort_limit} is above saturation_effort={cfg.saturation_effort}, so only "
+                "the torque-speed curve limits the force. Set effort_limit to the motor's peak "
+                "continuous effort.",
+                UserWarning,
+                stacklevel=2,
+            )
+
+    def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
+        """See `IdealPdActuator`; also makes the figures of the curve for every environment."""
+        super().initialize(mj_model, model, data, device)
+        self.saturation_effort = torch.full_like(self.stiffness, self.cfg.saturation_effort)
+        self.velocity_limit = torch.full_like(self.stiffness, self.cfg.velocity_limit)
+
+    @staticmethod
+    def control_law(params: dict[str, torch.Tensor], cmd: ActuatorCmd) -> torch.Tensor:
+        """Return the PD force, clamped to the torque-speed curve, (N, n)."""
+        return dc_motor_clip(
+            pd_torque(params["stiffness"], params["damping"], cmd),
+            params["saturation_effort"],
+            params["velocity_limit"],
+            params["force_limit"],
+            cmd.vel,
+        )

@@ -1,0 +1,133 @@
+"""Evaluating PD-like actuators of a kind together instead of one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeGuard
+
+import torch
+
+from mjlab.actuator._columns import (
+    Columns,
+    EnvIds,
+    as_columns,
+    write_columns,
+)
+from mjlab.actuator._delay import delay_rows
+from mjlab.actuator.actuator import Actuator, ActuatorCmd, TransmissionType
+from mjlab.actuator.builtin_group import delay_settings, share_line
+from mjlab.actuator.command import read_command
+from mjlab.actuator.pd_actuator import IdealPdActuator
+from mjlab.utils.buffers import DelayBuffer
+
+if TYPE_CHECKING:
+    from mjlab.entity import EntityData
+
+# What a subclass must not have changed, for its actuators to be evaluated by a group.
+_METHODS = ("compute", "compute_after_reset", "get_command", "apply_delay", "apply_controls")
+
+
+@dataclass
+class _FusedGroup:
+    """Actuators of one class, transmission and delay, with their columns side by side."""
+
+    actuators: list[IdealPdActuator]
+    source: Columns = field(default_factory=lambda: slice(0))
+    ctrl: Columns = field(default_factory=lambda: slice(0))
+    params: dict[str, torch.Tensor] = field(default_factory=dict)
+    line: DelayBuffer | None = None
+
+    def initialize(self, num_envs: int, device: str) -> None:
+        # In the order of controls, so that they are neighbours wherever possible.
+        self.actuators.sort(key=lambda actuator: int(actuator.global_ctrl_ids.min()))
+        self.source = as_columns(_joined([a.target_ids for a in self.actuators]), device)
+        self.ctrl = as_columns(_joined([a.global_ctrl_ids for a in self.actuators]), device)
+        self.params = {
+            name: torch.cat([_parameter(a, name) for a in self.actuators], dim=1)
+            for name in self.actuators[0].param_names
+        }
+        widths = [len(actuator.target_ids) for actuator in self.actuators]
+        parts = {name: value.split(widths, dim=1) for name, value in self.params.items()}
+        for k, actuator in enumerate(self.actuators):
+            actuator.share_parameters({name: part[k] for name, part in parts.items()})
+        if self.actuators[0].has_delay:
+            self.line = share_line(self.actuators, num_envs, device)
+        else:
+            for actuator in self.actuators:
+                actuator.join_group(None, resets_delay=False)
+
+    def apply_controls(self, data: EntityData, env_ids: EnvIds) -> None:
+        first = self.actuators[0]
+        cmd = read_command(data, first.transmission_type, self.source)
+        if self.line is not None:
+            targets = (cmd.position_target, cmd.velocity_target, cmd.effort_target)
+            cmd = ActuatorCmd(*delay_rows(self.line, targets, env_ids), cmd.pos, cmd.vel)
+        ctrl = first.control_law(self.params, cmd)
+        write_columns(data.data.ctrl, self.ctrl, ctrl, env_ids)
+
+
+@dataclass
+class FusedActuatorGroup:
+    """Actuators with the law of `IdealPdActuator`, or a subclass's own `control_law`.
+
+    Those of one class, transmission and delay settings are evaluated at once, and share one delay
+    line, hence one lag in each environment. Their parameters become parts of one tensor: change
+    them in place (assigning to them does that too). An actuator whose class has a `compute` of its
+    own is left to it.
+    """
+
+    _groups: list[_FusedGroup] = field(default_factory=list)
+
+    @staticmethod
+    def process(
+        actuators: Sequence[Actuator],
+    ) -> tuple[FusedActuatorGroup, tuple[Actuator, ...]]:
+        """Return the groups of the actuators that can be fused, and all others in order."""
+        groups: dict[Any, _FusedGroup] = {}
+        others = []
+        for actuator in actuators:
+            if not _is_fusable(actuator):
+                others.append(actuator)
+                continue
+            group = groups.setdefault(delay_settings(actuator), _FusedGroup([]))
+            group.actuators.append(actuator)
+        return FusedActuatorGroup(list(groups.values())), tuple(others)
+
+    def initialize(self, num_envs: int, device: str) -> None:
+        """Join the parameters and make the delay lines. The actuators must be initialized."""
+        for group in self._groups:
+            group.initialize(num_envs, device)
+
+    def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
+        """Compute and write the controls of all actuators of the groups.
+
+        With `env_ids`, which must just have been reset, nothing of any other environment changes.
+        """
+        for group in self._groups:
+            group.apply_controls(data, env_ids)
+
+
+def _is_fusable(actuator: Actuator) -> TypeGuard[IdealPdActuator]:
+    return (
+        isinstance(actuator, IdealPdActuator)
+        and all(
+            getattr(type(actuator), name) is getattr(IdealPdActuator, name) for name in _METHODS
+        )
+        and actuator.transmission_type != TransmissionType.SITE
+    )
+
+
+def _joined(ids: list[torch.Tensor]) -> list[int]:
+    return torch.cat(ids).tolist()
+
+
+def _parameter(actuator: IdealPdActuator, name: str) -> torch.Tensor:
+    value, shape = getattr(actuator, name, None), actuator.stiffness.shape
+    if not isinstance(value, torch.Tensor) or value.shape != shape:
+        found = tuple(value.shape) if isinstance(value, torch.Tensor) else repr(value)
+        raise ValueError(
+            f"{type(actuator).__name__} for {actuator.target_names}: param_names lists {name!r}, "
+            f"which must be a tensor of shape {tuple(shape)} after initialize, but is {found}."
+        )
+    return value

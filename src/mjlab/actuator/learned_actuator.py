@@ -1,0 +1,176 @@
+"""Actuators whose force a neural network predicts."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+
+from mjlab.actuator._columns import EnvIds
+from mjlab.actuator.actuator import ActuatorCmd
+from mjlab.actuator.dc_actuator import DcMotorActuator, DcMotorActuatorCfg, dc_motor_clip
+from mjlab.utils.buffers import CircularBuffer
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from mjlab.entity import Entity
+
+
+@dataclass(kw_only=True)
+class LearnedMlpActuatorCfg(DcMotorActuatorCfg):
+    """Network actuator, see `LearnedMlpActuator`."""
+
+    stiffness: float = 0.0
+    """Not used: the network stands for the controller too."""
+    damping: float = 0.0
+    """Not used."""
+    network_file: str
+    """TorchScript file of the network. Load only files you trust: TorchScript is code."""
+    pos_scale: float
+    """Factor on position errors (rad or m) at the network's input."""
+    vel_scale: float
+    """Factor on velocities (rad/s or m/s) at the network's input."""
+    torque_scale: float
+    """Factor on the network's output, giving a force (N m or N)."""
+    input_order: Literal["pos_vel", "vel_pos"] = "pos_vel"
+    """Which block of inputs comes first."""
+    history_length: int = 3
+    """Number H of substeps, the current one included, that the network sees."""
+
+    def validate(self) -> None:
+        """See `ActuatorCfg`."""
+        super().validate()
+        if self.input_order not in ("pos_vel", "vel_pos"):
+            self._refuse("input_order", "choose pos_vel or vel_pos")
+        if self.history_length < 1:
+            self._refuse("history_length", "the network sees at least the current substep")
+
+    def build(
+        self, entity: Entity, target_ids: list[int], target_names: list[str]
+    ) -> LearnedMlpActuator:
+        """See `ActuatorCfg`."""
+        return LearnedMlpActuator(self, entity, target_ids, target_names)
+
+
+class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
+    """Force = dc_motor_clip(torque_scale * network(inputs)).
+
+    With e = p* - l the inputs of a joint are [pos_scale (e_t, .., e_{t-H+1}), vel_scale (l'_t, ..,
+    l'_{t-H+1})], newest first, with blocks swapped for `input_order="vel_pos"`. The network sees
+    every joint of every environment as one row, (N n, 2 H), and returns (N n, 1). The first values
+    after a reset fill the whole history. Velocity and effort targets are not used.
+    """
+
+    _transient = {"_network"}
+
+    def __init__(
+        self,
+        cfg: LearnedMlpActuatorCfg,
+        entity: Entity,
+        target_ids: list[int],
+        target_names: list[str],
+    ) -> None:
+        """See `Actuator`. Raises `FileNotFoundError` if the network's file does not exist."""
+        super().__init__(cfg, entity, target_ids, target_names)
+        if not Path(cfg.network_file).is_file():
+            raise FileNotFoundError(
+                f"{type(cfg).__name__} for {cfg.target_names_expr}: there is no network file "
+                f"{cfg.network_file!r}. Save one with torch.jit.script(network).save(path)."
+            )
+        self._network: Any = None
+        self._history: CircularBuffer | None = None
+
+    def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
+        """See `DcMotorActuator`; also loads the network and tries it.
+
+        Raises:
+            ValueError: the file is no TorchScript, or the network does not take (N n, 2 H) inputs
+                and return (N n, 1).
+        """
+        super().initialize(mj_model, model, data, device)
+        self._network = self._load_network(device)
+        num_envs, num_targets = self.stiffness.shape
+        self._history = CircularBuffer(self.cfg.history_length, num_envs, device)
+        # The first frame makes the buffer's memory; after the reset no environment has a history.
+        self._history.append(torch.zeros(num_envs, 2, num_targets, device=device))
+        self._history.reset()
+        self._try_network()
+
+    def compute(self, cmd: ActuatorCmd) -> torch.Tensor:
+        """Add the command and feedback to the histories and return the forces, (N, n)."""
+        self._buffer.append(self._frame(cmd))
+        return self._force(cmd)
+
+    def compute_after_reset(self, cmd: ActuatorCmd, env_ids: torch.Tensor | slice) -> torch.Tensor:
+        """As `compute`, but start the histories of `env_ids` and leave all others alone."""
+        self._buffer.backfill(self._frame(cmd), env_ids)
+        return self._force(cmd)
+
+    def reset(self, env_ids: EnvIds = None) -> None:
+        """Forget the delay line and the histories of these environments."""
+        super().reset(env_ids)
+        self._buffer.reset(env_ids)
+
+    @property
+    def _buffer(self) -> CircularBuffer:
+        if self._history is None:
+            raise RuntimeError(f"LearnedMlpActuator for {self._target_names} is not initialized.")
+        return self._history
+
+    def _frame(self, cmd: ActuatorCmd) -> torch.Tensor:
+        """Return one substep of inputs, (N, 2, n)."""
+        blocks = [
+            self.cfg.pos_scale * (cmd.position_target - cmd.pos),
+            self.cfg.vel_scale * cmd.vel,
+        ]
+        if self.cfg.input_order == "vel_pos":
+            blocks.reverse()
+        return torch.stack(blocks, dim=1)
+
+    def _force(self, cmd: ActuatorCmd) -> torch.Tensor:
+        # (N, H, 2, n), oldest first, to one row a joint, newest first.
+        frames = self._buffer.buffer.flip(1).permute(0, 3, 2, 1)
+        inputs = frames.reshape(-1, 2 * self.cfg.history_length)
+        with torch.no_grad():
+            output = self._network(inputs)
+        force = self.cfg.torque_scale * output.reshape(cmd.pos.shape)
+        return dc_motor_clip(
+            force, self.saturation_effort, self.velocity_limit, self.force_limit, cmd.vel
+        )
+
+    def _load_network(self, device: str) -> Any:
+        try:
+            with warnings.catch_warnings():
+                # Torch would rather have other formats, but TorchScript is what these files are.
+                warnings.simplefilter("ignore", DeprecationWarning)
+                network = torch.jit.load(self.cfg.network_file, map_location=device)
+        except RuntimeError as error:
+            raise ValueError(
+                f"{self.cfg.network_file!r} is no TorchScript file that can be loaded. Save the "
+                f"network with torch.jit.script(network).save(path). ({error})"
+            ) from error
+        return network.eval()
+
+    def _try_network(self) -> None:
+        num_rows, num_inputs = self.stiffness.numel(), 2 * self.cfg.history_length
+        inputs = torch.zeros(num_rows, num_inputs, device=self.stiffness.device)
+        expected = (
+            f"({num_rows}, {num_inputs}) inputs (2 x history_length={self.cfg.history_length}, a "
+            f"row a joint) and return ({num_rows}, 1)"
+        )
+        try:
+            with torch.no_grad():
+                output = self._network(inputs)
+        except RuntimeError as error:
+            raise ValueError(
+                f"The network {self.cfg.network_file!r} must take {expected}, but fails: {error}"
+            ) from error
+        if output.shape != (num_rows, 1):
+            raise ValueError(
+                f"The network {self.cfg.network_file!r} must take {expected}, but returns "
+                f"{tuple(output.shape)}."
+            )

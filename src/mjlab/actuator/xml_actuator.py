@@ -1,0 +1,154 @@
+"""Actuators that the XML of an entity already has."""
+
+from __future__ import annotations
+
+import warnings
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mujoco
+
+from mjlab.actuator.actuator import ActuatorCfg, TransmissionType
+from mjlab.actuator.direct import DirectActuator
+from mjlab.compat import older_names
+from mjlab.utils.mujoco import CommandField, detect_command_field
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+
+__getattr__ = older_names(__name__)
+
+_TRANSMISSIONS = {
+    TransmissionType.JOINT: (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT),
+    TransmissionType.TENDON: (mujoco.mjtTrn.mjTRN_TENDON,),
+    TransmissionType.SITE: (mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtTrn.mjTRN_SLIDERCRANK),
+}
+
+
+@dataclass(kw_only=True)
+class XmlActuatorCfg(ActuatorCfg):
+    """Take over actuators of the XML, see `XmlActuator`."""
+
+    command_field: CommandField | None = None
+    """What the controls are: position, velocity or effort. None detects it from each actuator."""
+
+    def validate(self) -> None:
+        """See `ActuatorCfg`."""
+        super().validate()
+        if self.command_field not in (None, "position", "velocity", "effort"):
+            self._refuse("command_field", "choose position, velocity, effort, or None to detect it")
+
+    def build(self, entity: Entity, target_ids: list[int], target_names: list[str]) -> XmlActuator:
+        """See `ActuatorCfg`."""
+        return XmlActuator(self, entity, target_ids, target_names)
+
+
+class XmlActuator(DirectActuator[XmlActuatorCfg]):
+    """The first actuator of the XML on each target, passed the command that its kind reads.
+
+    Targets without an actuator are left out. Armature, friction loss and damping of the config are
+    written to the others, as for every kind.
+    """
+
+    _transient = {"_command_field"}
+
+    def __init__(
+        self,
+        cfg: XmlActuatorCfg,
+        entity: Entity,
+        target_ids: list[int],
+        target_names: list[str],
+    ) -> None:
+        """See `Actuator`."""
+        super().__init__(cfg, entity, target_ids, target_names)
+        self._command_field: CommandField | None = cfg.command_field
+
+    @property
+    def command_field(self) -> CommandField:
+        """What the controls are: "position", "velocity" or "effort".
+
+        Raises `RuntimeError` before `edit_spec`, unless the config states it.
+        """
+        if self._command_field is None:
+            raise RuntimeError(
+                f"The kind of the XML actuators on {self._target_names} is not known yet; it is "
+                "detected when the entity is built."
+            )
+        return self._command_field
+
+    @property
+    def command_fields(self) -> tuple[CommandField, ...]:
+        """The one command that all elements read."""
+        return (self.command_field,)
+
+    def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
+        """Find the elements for `target_names`; all targets have to be given at once.
+
+        Raises:
+            ValueError: no target has an actuator, the actuators are of several kinds, or
+                `command_field` contradicts what they are.
+        """
+        found = self._find_elements(spec)
+        kept = [k for k, name in enumerate(target_names) if name in found]
+        if not kept:
+            raise ValueError(self._nothing_found(spec, target_names))
+        self._mjs_actuators = [found[target_names[k]] for k in kept]
+        self._command_field = self._agreed_field()
+        if self.transmission_type == TransmissionType.SITE and self._command_field != "effort":
+            warnings.warn(
+                f"The XML actuators on the sites {target_names} read a {self._command_field}, but "
+                "sites have effort targets only, so their control stays 0.",
+                UserWarning,
+                stacklevel=2,
+            )
+        self._target_ids_list = [self._target_ids_list[k] for k in kept]
+        self._target_names = [self._target_names[k] for k in kept]
+        for k in kept:
+            self._override_target(spec, target_names[k])
+
+    def _find_elements(self, spec: mujoco.MjSpec) -> dict[str, mujoco.MjsActuator]:
+        """Return the first actuator of each target with this transmission."""
+        found: dict[str, mujoco.MjsActuator] = {}
+        for element in spec.actuators:
+            if element.trntype in _TRANSMISSIONS[self.transmission_type]:
+                found.setdefault(element.target, element)
+        return found
+
+    def _agreed_field(self) -> CommandField:
+        stated = self.cfg.command_field
+        detected: dict[CommandField, list[str]] = defaultdict(list)
+        for element in self._mjs_actuators:
+            try:
+                field = detect_command_field(element)
+            except ValueError:
+                # Detection does not know every kind; what the config states is trusted then.
+                if stated is None:
+                    raise
+                field = stated
+            detected[field].append(element.name or element.target)
+        breakdown = "; ".join(f"{field}: {names}" for field, names in detected.items())
+        if len(detected) > 1:
+            raise ValueError(
+                f"XmlActuatorCfg for {self.cfg.target_names_expr} matches actuators of several "
+                f"kinds ({breakdown}). Use one config for each kind."
+            )
+        if stated is not None and stated not in detected:
+            raise ValueError(
+                f"XmlActuatorCfg for {self.cfg.target_names_expr} has command_field={stated!r}, "
+                f"but the XML has {breakdown}. Leave command_field out to follow the XML."
+            )
+        return next(iter(detected))
+
+    def _nothing_found(self, spec: mujoco.MjSpec, target_names: list[str]) -> str:
+        existing = [
+            f"{element.name or '(unnamed)'} on {element.trntype.name.removeprefix('mjTRN_').lower()}"
+            f" {element.target!r}"
+            for element in spec.actuators
+        ]
+        return (
+            f"XmlActuatorCfg for {self.cfg.target_names_expr} matches the "
+            f"{self.transmission_type.value}s {target_names}, but the XML has no actuator on any of "
+            f"them. It has: {existing or 'no actuators'}. Add one to the XML, or use a config "
+            "that makes actuators, such as BuiltinPositionActuatorCfg."
+        )
