@@ -84,7 +84,7 @@ class Simulation:
             self._mj_model,
             model_fields=lambda: {name: getattr(self._model, name) for name in self._expanded},
         )
-        logger.info("Physics: %s, %d environments.", self.capabilities.description, num_envs)
+        logger.debug("Physics: %s, %d environments.", self.capabilities.description, num_envs)
 
     # What there is.
 

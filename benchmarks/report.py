@@ -1,0 +1,72 @@
+"""Rows of the benchmark table, and where they go."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from pathlib import Path
+
+RESULTS = Path(__file__).parent / "results"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table."""
+
+    what: str
+    """What was measured."""
+    measured: str
+    """The figure."""
+    compared_with: str
+    """The comparison, measured in the same run, and its figure."""
+    to_reach: str
+    """The figure to reach."""
+    reached: bool | None
+    """Whether it was reached; None where there is nothing to reach."""
+
+
+def show(rows: list[Row]) -> str:
+    """Return the rows as a Markdown table."""
+    lines = [
+        "| what | measured | compared with | to reach | reached |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for row in rows:
+        verdict = {True: "yes", False: "**no**", None: ""}[row.reached]
+        cells = (row.what, row.measured, row.compared_with, row.to_reach, verdict)
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def write(rows: list[Row]) -> None:
+    """Write the table, with the machine it was measured on, as Markdown and JSON."""
+    import mjbatch  # noqa: F401 - a benchmark without the engine would be of something else.
+    import mujoco
+    import torch
+
+    machine = {
+        "date": datetime.now().strftime("%Y-%m-%d %H:%M"),
+        "cores": os.cpu_count(),
+        "processor": _processor(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "mujoco": mujoco.__version__,
+        "load_average": round(os.getloadavg()[0], 2),
+    }
+    RESULTS.mkdir(exist_ok=True)
+    about = ", ".join(f"{name} {value}" for name, value in machine.items())
+    (RESULTS / "table.md").write_text(f"{show(rows)}\n\nMeasured: {about}.\n")
+    content = {"machine": machine, "rows": [asdict(row) for row in rows]}
+    (RESULTS / "table.json").write_text(json.dumps(content, indent=2) + "\n")
+
+
+def _processor() -> str:
+    for line in (
+        Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else ()
+    ):
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()

@@ -1,0 +1,24 @@
+"""Run every benchmark and write the table: `make bench`."""
+
+from __future__ import annotations
+
+import learning
+import repeatability
+import startup
+import throughput
+from report import RESULTS, Row, show, write
+
+
+def main() -> None:
+    rows: list[Row] = []
+    for benchmark in (throughput, startup, repeatability, learning):
+        print(f"{benchmark.__name__} ...", flush=True)
+        rows += benchmark.measure()
+        # Written after each, so that a long run that is stopped has left what it measured.
+        write(rows)
+    print(show(rows))
+    print(f"\nWritten to {RESULTS / 'table.md'}")
+
+
+if __name__ == "__main__":
+    main()
