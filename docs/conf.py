@@ -1,0 +1,83 @@
+"""Sphinx settings. Everything is built from this checkout, without network."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from sphinx.application import Sphinx
+from sphinx.ext.napoleon import Config, GoogleDocstring
+
+from mjlab.envs.mdp.dr._table import TABLE
+
+_ROOT = Path(__file__).resolve().parents[1]
+
+project = "mjlab"
+author = "the mjlab developers"
+release = tomllib.loads((_ROOT / "pyproject.toml").read_text())["project"]["version"]
+version = release
+
+extensions = ["myst_parser", "sphinx.ext.autodoc"]
+exclude_patterns = ["_build"]
+
+myst_heading_anchors = 3
+
+html_theme = "furo"
+html_title = f"mjlab {release}"
+
+autodoc_typehints = "signature"
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+python_use_unqualified_type_names = True
+
+# How docstrings are written: sections as Google has them, and `Params`, the section of class-based
+# terms, whose parameters are given in a config.
+_SECTIONS: Any = Config(
+    napoleon_custom_sections=[("Params", "params_style")], napoleon_use_rtype=False
+)
+
+# A line that ends with a colon, and indented text after it, which is a formula or code.
+_FORMULA = re.compile(r"(?m)^(\S.*):\n\n((?:    .*\n?|\n)+)")
+_CODE = re.compile(r"(?<!`)`([^`]+)`(?!`)")
+
+
+def _to_rst(app: Sphinx, what: Any, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Turn a docstring, which is plain text with backquotes around code, into reStructuredText."""
+    # Three parts to a formula: the text before it, the line above it, and itself.
+    parts = _FORMULA.split("\n".join(lines))
+    parts[0::3] = [_inline(part) for part in parts[0::3]]
+    parts[1::3] = [f"{_inline(part)}::\n\n" for part in parts[1::3]]
+    lines[:] = "".join(parts).split("\n")
+    # In the docstring of a field, a colon is a colon.
+    if what not in ("attribute", "data", "property"):
+        lines[:] = GoogleDocstring(lines, _SECTIONS, what=what).lines()
+
+
+def _inline(text: str) -> str:
+    """Mark code, and let no other character be markup."""
+    parts = _CODE.split(text)
+    parts[0::2] = [re.sub(r"([|*])", r"\\\1", part) for part in parts[0::2]]
+    parts[1::2] = [f"``{' '.join(part.split())}``" for part in parts[1::2]]
+    return "".join(parts)
+
+
+def _readable(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str, returns: str
+) -> tuple[str, str | None] | None:
+    """Shorten the signatures of configs, and complete those of functions made from a table."""
+    if what == "class" and dataclasses.is_dataclass(obj):
+        # The fields are listed below, with their meanings.
+        return "", None
+    if signature and "row.operation" in signature:
+        operation = TABLE[name.rpartition(".")[2]].operation
+        return signature.replace("row.operation", repr(operation)), returns
+    return None
+
+
+def setup(app: Sphinx) -> None:
+    """Register what is done to docstrings and signatures."""
+    app.connect("autodoc-process-signature", _readable)
+    app.connect("autodoc-process-docstring", _to_rst)

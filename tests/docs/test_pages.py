@@ -1,0 +1,117 @@
+"""What the pages of the documentation name exists."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted((ROOT / "docs").glob("*.md")) + sorted((ROOT / "docs" / "api").glob("*.md"))
+
+_COMMAND = re.compile(r"\buv run (?:--\S+ )*([\w-]+)")
+_FLAG = re.compile(r"(?<![\w-])--([a-z][\w.-]*[a-z])")
+_OBJECT = re.compile(r"^\.\. auto\w+:: (\S+)$", re.MULTILINE)
+_MAKE = re.compile(r"\bmake ([a-z-]+)")
+
+# Flags of `train` that stand for any field of the configs, and those of other programs.
+_ELSEWHERE = {"help", "seeds", "keyword", "output", "tag", "title", "group"}
+
+
+def _ids(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def _code(text: str) -> str:
+    return "\n".join(re.findall(r"```.*?```|`[^`\n]+`", text, re.DOTALL))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_ids)
+def test_commands_are_console_scripts(page: Path) -> None:
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    commands = set(_COMMAND.findall(page.read_text(encoding="utf-8")))
+    assert commands <= {*scripts, "python"}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_ids)
+def test_make_targets_exist(page: Path) -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    assert set(_MAKE.findall(_code(page.read_text(encoding="utf-8")))) <= targets
+
+
+def test_flags_are_fields_of_the_commands() -> None:
+    from dataclasses import fields, is_dataclass
+
+    from mjlab.scripts.evaluate import EvaluateConfig
+    from mjlab.scripts.play import PlayConfig
+    from mjlab.scripts.train import TrainConfig
+
+    def exists(config: object, path: list[str]) -> bool:
+        if not path:
+            return True
+        name = path[0].replace("-", "_")
+        if isinstance(config, dict):
+            return name in config and exists(config[name], path[1:])
+        if not is_dataclass(config) or name not in {field.name for field in fields(config)}:
+            return False
+        return exists(getattr(config, name), path[1:])
+
+    configs = (TrainConfig.from_task("Mjlab-Cartpole-Swingup"), PlayConfig(), EvaluateConfig())
+    unknown = set()
+    for page in PAGES:
+        for flag in _FLAG.findall(_code(page.read_text(encoding="utf-8"))):
+            known = flag in _ELSEWHERE or any(exists(cfg, flag.split(".")) for cfg in configs)
+            if not known:
+                unknown.add(f"{page.name}: --{flag}")
+    assert not unknown
+
+
+def test_documented_objects_exist() -> None:
+    named = [name for page in PAGES for name in _OBJECT.findall(page.read_text(encoding="utf-8"))]
+    assert len(named) > 100
+    for name in named:
+        assert _resolve(name) is not None
+
+
+def _resolve(name: str) -> object:
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        module, _, attribute = name.rpartition(".")
+        return getattr(importlib.import_module(module), attribute)
+
+
+def test_the_randomization_table_is_that_of_the_code() -> None:
+    from mjlab.envs.mdp import dr
+    from mjlab.envs.mdp.dr._table import TABLE
+
+    text = (ROOT / "docs" / "randomization.md").read_text(encoding="utf-8")
+    rows = re.findall(
+        r"^\| `(\w+)` \| `(\w+)`[^|]*\| [^|]+ \| (\S+) \| (\w*) ?\|$", text, re.MULTILINE
+    )
+    expected = {
+        (
+            row.name,
+            row.field,
+            "rotation" if row.rotation else f"`{row.operation}`",
+            "yes" if row.recompute else "",
+        )
+        for row in TABLE.values()
+    }
+    assert set(rows) == expected
+    functions = {getattr(dr, name).__name__ for name in dr.__all__ if name[0].islower()}
+    assert functions <= set(re.findall(r"`(\w+)`", text))
+
+
+@pytest.mark.slow
+def test_the_pages_build_without_warnings(tmp_path: Path) -> None:
+    pytest.importorskip("sphinx")
+    command = ["sphinx-build", "-q", "-W", "--keep-going", "-b", "html"]
+    built = subprocess.run(
+        [*command, str(ROOT / "docs"), str(tmp_path)], capture_output=True, text=True, check=False
+    )
+    assert built.returncode == 0, built.stderr
