@@ -37,7 +37,7 @@ def test_a_name_that_never_was_is_an_attribute_error(module):
 def test_a_class_warns_once_with_todays_spelling():
     import mjlab.actuator
 
-    with pytest.warns(DeprecationWarning, match=r"today it is mjlab.actuator.xml_actuator") as seen:
+    with pytest.warns(FutureWarning, match=r"today it is mjlab.actuator.xml_actuator") as seen:
         cfg = mjlab.actuator.XmlMotorActuatorCfg
         assert mjlab.actuator.XmlMotorActuatorCfg is cfg
     assert len(seen) == 1
@@ -59,7 +59,7 @@ def test_an_older_function_keeps_what_it_declares_and_warns_when_called():
     older = mdp.randomize_pd_gains
     assert older.model_fields == mdp.dr.pd_gains.model_fields
     with (
-        pytest.warns(DeprecationWarning, match="mjlab.envs.mdp.dr.pd_gains"),
+        pytest.warns(FutureWarning, match="mjlab.envs.mdp.dr.pd_gains"),
         pytest.raises(TypeError),
     ):
         older()
@@ -78,7 +78,7 @@ def test_an_older_function_keeps_what_it_declares_and_warns_when_called():
     ],
 )
 def test_older_noise_fields_become_a_distribution(given, expected):
-    with pytest.warns(DeprecationWarning, match="distribution_cfg"):
+    with pytest.warns(FutureWarning, match="distribution_cfg"):
         distribution = RslRlModelCfg(**given).distribution_cfg
     if expected is None:
         assert distribution is None
@@ -87,13 +87,13 @@ def test_older_noise_fields_become_a_distribution(given, expected):
 
 
 def test_fields_once_optional_are_filled_in():
-    with pytest.warns(DeprecationWarning, match=r"CollisionCfg.condim has to be given"):
+    with pytest.warns(FutureWarning, match=r"CollisionCfg.condim has to be given"):
         cfg = CollisionCfg(geom_names_expr=(".*",), contype=2)  # ty: ignore
     assert (cfg.contype, cfg.conaffinity, cfg.condim, cfg.priority) == (2, 1, 3, 0)
 
 
 def test_a_flag_without_effect_is_accepted():
-    with pytest.warns(DeprecationWarning, match="domain_randomization"):
+    with pytest.warns(FutureWarning, match="domain_randomization"):
         cfg = EventTermCfg(func=print, mode="reset", domain_randomization=True)  # ty: ignore
     assert cfg.mode == "reset"
 

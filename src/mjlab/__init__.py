@@ -1,11 +1,13 @@
 """Robot learning from small composable pieces, on MuJoCo's CPU threads or on NVIDIA GPUs.
 
-Importing this package does one thing beyond defining names: on Linux, unless the variable is set
-already, it sets `MUJOCO_GL=egl`, so that MuJoCo renders without a display.
+Importing this package does one thing beyond defining names: on Linux, where the EGL library is
+installed and the variable is not set already, it sets `MUJOCO_GL=egl`, so that MuJoCo renders
+without a display.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 from typing import TYPE_CHECKING, Any
@@ -13,8 +15,19 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     TYRO_FLAGS: tuple[Any, ...]
 
-if sys.platform == "linux":
-    os.environ.setdefault("MUJOCO_GL", "egl")
+
+def _prefer_egl() -> None:
+    if sys.platform != "linux" or "MUJOCO_GL" in os.environ:
+        return
+    # With the variable set, `import mujoco` fails where the library is missing.
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        return
+    os.environ["MUJOCO_GL"] = "egl"
+
+
+_prefer_egl()
 
 
 def __getattr__(name: str) -> Any:

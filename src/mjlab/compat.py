@@ -98,7 +98,9 @@ def _set_std(value: Any, fields: dict[str, Any], key: str) -> None:
 
 
 def _set_stochastic(value: Any, fields: dict[str, Any]) -> None:
-    fields["distribution_cfg"] = dict(fields.get("distribution_cfg") or _GAUSSIAN) if value else None
+    fields["distribution_cfg"] = (
+        dict(fields.get("distribution_cfg") or _GAUSSIAN) if value else None
+    )
 
 
 _DROPPED_FIELDS: dict[str, dict[str, tuple[str, _Translation | None]]] = {
@@ -117,10 +119,11 @@ _DROPPED_FIELDS: dict[str, dict[str, tuple[str, _Translation | None]]] = {
         ),
     },
     "MujocoCfg": {
+        # Today's MuJoCo has it on, and a flag that switches it off.
         "multiccd": (
-            "enableflags=('multiccd',)",
+            "disableflags=('multiccd',) to switch it off",
             lambda value, fields: fields.update(
-                enableflags=(*fields.get("enableflags", ()), *(("multiccd",) if value else ()))
+                disableflags=(*fields.get("disableflags", ()), *(() if value else ("multiccd",)))
             ),
         )
     },
@@ -130,7 +133,8 @@ _LOOSE_DEFAULTS: dict[str, dict[str, Any]] = {"CollisionCfg": _REQUIRED_BEFORE_1
 
 @functools.cache
 def _warn_once(message: str) -> None:
-    warnings.warn(message, DeprecationWarning, stacklevel=4)
+    # A FutureWarning, because Python hides deprecations from those who run a package.
+    warnings.warn(message, FutureWarning, stacklevel=3)
 
 
 def older_names(module_name: str) -> Callable[[str], Any]:
@@ -170,11 +174,12 @@ def _warning_when_called(function: Callable[..., Any], message: str) -> Callable
     return older
 
 
-def accepts_older_fields(cls: C) -> C:
+def accepts_older_fields(config_class: C) -> C:
     """Class decorator for configs: take fields that were dropped, and defaults that were lost."""
+    cls: Any = config_class
     dropped = _DROPPED_FIELDS.get(cls.__name__, {})
     defaults = _LOOSE_DEFAULTS.get(cls.__name__, {})
-    plain_init: Any = cls.__init__
+    plain_init = cls.__init__
     positions = [field.name for field in dataclasses.fields(cls) if field.init]
 
     @functools.wraps(plain_init)
@@ -192,7 +197,7 @@ def accepts_older_fields(cls: C) -> C:
         plain_init(self, *args, **kwargs)
 
     cls.__init__ = __init__
-    return cls
+    return config_class
 
 
 # Small things that have no successor, as they were.

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from mjlab import compat
 from mjlab.sim import MujocoCfg, Simulation, SimulationCfg
 from mjlab.sim.engine import EngineUnavailableError
 
@@ -375,5 +376,11 @@ def test_options_are_written_and_unknown_ones_listed():
 
 
 def test_an_older_flag_is_accepted_with_a_warning():
-    with pytest.warns(DeprecationWarning, match="multiccd"):
-        assert MujocoCfg(multiccd=True).enableflags == ("multiccd",)  # ty: ignore
+    compat._warn_once.cache_clear()
+    with pytest.warns(FutureWarning, match="multiccd"):
+        on = MujocoCfg(multiccd=True)  # ty: ignore
+    # MuJoCo has it on by default today, so only False has an effect.
+    assert (on.enableflags, on.disableflags) == ((), ())
+    off = MujocoCfg(multiccd=False, disableflags=("contact",))  # ty: ignore
+    assert off.disableflags == ("contact", "multiccd")
+    off.apply(mujoco.MjModel.from_xml_string("<mujoco/>"))

@@ -176,7 +176,7 @@ def test_it_stands_in_for_the_environment(tmp_path) -> None:
     env.num_steps = 41
     assert inner.num_steps == 41
     with pytest.raises(AttributeError):
-        env.no_such_thing  # noqa: B018
+        env.no_such_thing
     env.reset(seed=3)
     assert inner.num_resets == 1
 

@@ -76,7 +76,7 @@ class ManagerBasedRlEnv:
         self.sim = self._create_simulation()
         self.scene.initialize(self.sim.mj_model, self.sim.model, self.sim.data)
         self.sim.add_forward_callback(self.scene.invalidate_sensor_caches)
-        if getattr(self.scene, "sensor_context", None) is not None:
+        if self.scene.sensor_context is not None:
             self.sim.set_sensor_context(self.scene.sensor_context)
 
         self.common_step_counter = 0
@@ -85,6 +85,7 @@ class ManagerBasedRlEnv:
         self._pending_reset = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
         self._nan_resets = torch.zeros(self.num_envs, dtype=torch.long, device=device)
         self._renderer: OffscreenRenderer | None = None
+        self._renderer_is_open = False
         if render_mode == "rgb_array":
             self._renderer = self._create_renderer()
         self.metadata["render_fps"] = 1.0 / self.step_dt
@@ -145,15 +146,13 @@ class ManagerBasedRlEnv:
     def _create_renderer(self) -> OffscreenRenderer:
         from mjlab.viewer.offscreen_renderer import OffscreenRenderer
 
-        renderer = OffscreenRenderer(
+        return OffscreenRenderer(
             model=self.sim.mj_model,
             cfg=self.cfg.viewer,
             scene=self.scene,
             sim_model=self.sim.model,
             expanded_fields=self.sim.expanded_fields,
         )
-        renderer.initialize()
-        return renderer
 
     def load_managers(self) -> None:
         """Build all managers, in the order in which they depend on each other."""
@@ -168,9 +167,7 @@ class ManagerBasedRlEnv:
         self.action_manager = ActionManager(cfg.actions, self)
         self.observation_manager = ObservationManager(cfg.observations, self)
         self.termination_manager = TerminationManager(cfg.terminations, self)
-        self.reward_manager = RewardManager(
-            cfg.rewards, self, scale_by_dt=cfg.scale_rewards_by_dt
-        )
+        self.reward_manager = RewardManager(cfg.rewards, self, scale_by_dt=cfg.scale_rewards_by_dt)
         self.curriculum_manager = (
             CurriculumManager(cfg.curriculum, self) if cfg.curriculum else NullCurriculumManager()
         )
@@ -201,15 +198,12 @@ class ManagerBasedRlEnv:
     def _configure_spaces(self) -> None:
         groups: dict[str, spaces.Space] = {}
         for name, term_names in self.observation_manager.active_terms.items():
-            dims = self.observation_manager.group_obs_dim[name]
+            dims: Any = self.observation_manager.group_obs_dim[name]
             if self.observation_manager.group_obs_concatenate[name]:
                 groups[name] = spaces.Box(shape=tuple(dims))
             else:
-                terms = {
-                    term: spaces.Box(shape=tuple(dim))
-                    for term, dim in zip(term_names, dims, strict=True)
-                }
-                groups[name] = spaces.Dict(spaces=terms)
+                boxes: list[spaces.Space] = [spaces.Box(shape=tuple(dim)) for dim in dims]
+                groups[name] = spaces.Dict(spaces=dict(zip(term_names, boxes, strict=True)))
         self.single_observation_space = spaces.Dict(spaces=groups)
         self.single_action_space = spaces.Box(shape=(self.action_manager.total_action_dim,))
         self.observation_space = spaces.batch_space(self.single_observation_space, self.num_envs)
@@ -409,6 +403,9 @@ class ManagerBasedRlEnv:
         """Return an RGB image (height, width, 3) of uint8 in mode `rgb_array`, else None.
 
         `camera` names a camera of the model; None takes the view of the config.
+
+        Raises:
+            RenderingUnavailableError: this machine cannot render; the message says what to install.
         """
         if self.render_mode in (None, "human"):
             return None
@@ -416,9 +413,11 @@ class ManagerBasedRlEnv:
             raise NotImplementedError(
                 f"Render mode {self.render_mode!r} is not supported; use 'rgb_array' or None."
             )
-        self._renderer.update(
-            self.sim, debug_vis_callback=self.update_visualizers, camera=camera
-        )
+        # Opened late, so that a machine that cannot render can still train.
+        if not self._renderer_is_open:
+            self._renderer.initialize()
+            self._renderer_is_open = True
+        self._renderer.update(self.sim, debug_vis_callback=self.update_visualizers, camera=camera)
         return self._renderer.render()
 
     def update_visualizers(self, visualizer: DebugVisualizer) -> None:

@@ -16,7 +16,7 @@ from mjlab.utils.state import stateful
 class ObservationGroupCfg:
     """A named group of observation terms, such as "actor" or "critic"."""
 
-    terms: dict[str, ObservationTermCfg]
+    terms: dict[str, ObservationTermCfg | None]
     """Terms by name, in order. None switches a term off."""
 
     concatenate_terms: bool = True

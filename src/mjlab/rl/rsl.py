@@ -16,7 +16,7 @@ import inspect
 import os
 import sys
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from typing import Any
 
 import torch
@@ -30,7 +30,7 @@ _OPTIMIZER_METHODS = ("add_param_group", "zero_grad", "state_dict", "load_state_
 
 
 @contextlib.contextmanager
-def _registrations_put_off() -> Iterator[None]:
+def _registrations_put_off() -> Generator[None]:
     names = ("allow_in_graph", "assume_constant_result")
     originals = {name: getattr(torch.compiler, name) for name in names}
 
@@ -51,7 +51,7 @@ def _registrations_put_off() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _clients_hidden() -> Iterator[None]:
+def _clients_hidden() -> Generator[None]:
     # An entry of None makes `import` raise ModuleNotFoundError, which rsl_rl expects where a
     # client is not installed.
     hidden = [name for name in _LOGGING_CLIENTS if name not in sys.modules]

@@ -7,7 +7,7 @@ import io
 import logging
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -458,7 +458,7 @@ def _drop_unused_keys(train_cfg: dict) -> None:
 
 
 @contextlib.contextmanager
-def _printing_to_log() -> Iterator[None]:
+def _printing_to_log() -> Generator[None]:
     """Send what rsl_rl prints (networks, observation sets) to the log, at level DEBUG."""
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         yield

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 
 import torch
 
@@ -45,7 +45,7 @@ def _usable_cores() -> int:
 
 
 @contextlib.contextmanager
-def using_torch_threads(count: int) -> Iterator[None]:
+def using_torch_threads(count: int) -> Generator[None]:
     """Let torch use `count` threads within the block."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)

@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 
 
 # Fields that MuJoCo stores as nine numbers in a row and that cross the seam as 3 x 3 matrices.
-ROTATION_MATRICES = frozenset(
-    {"xmat", "ximat", "geom_xmat", "site_xmat", "cam_xmat", "cam_mat0"}
-)
+ROTATION_MATRICES = frozenset({"xmat", "ximat", "geom_xmat", "site_xmat", "cam_xmat", "cam_mat0"})
 
 
 class EngineUnavailableError(RuntimeError):

@@ -70,10 +70,13 @@ class SharedField(torch.Tensor):
         with torch._C.DisableTorchFunctionSubclass():
             result = func(*args, **(kwargs or {}))
         # Views still alias the shared row, so they stay protected.
-        if isinstance(target, SharedField) and isinstance(result, torch.Tensor):
-            if result.untyped_storage().data_ptr() == target.untyped_storage().data_ptr():
-                result = result.as_subclass(cls)
-                result.field_name = target.field_name
+        if (
+            isinstance(target, SharedField)
+            and isinstance(result, torch.Tensor)
+            and result.untyped_storage().data_ptr() == target.untyped_storage().data_ptr()
+        ):
+            result = result.as_subclass(cls)
+            result.field_name = target.field_name
         return result
 
 

@@ -49,7 +49,7 @@ class CameraView:
 def resolve_camera(
     cfg: ViewerConfig, model: mujoco.MjModel, entities: Mapping[str, Any]
 ) -> CameraView:
-    """Find what the camera of `cfg` follows in `model`.
+    """Find where the camera of `cfg` is and what it follows in `model`.
 
     Args:
         cfg: The viewer's configuration.
@@ -57,8 +57,10 @@ def resolve_camera(
         entities: The scene's entities by name; "terrain" is never followed.
 
     Raises:
-        ValueError: The entity or body does not exist, or is needed and was not named.
+        ValueError: The camera, entity or body does not exist, or is needed and was not named.
     """
+    if cfg.camera is not None:
+        return _view_of_model_camera(cfg, model)
     return CameraView(
         body_id=_followed_body(cfg, model, entities),
         lookat=cfg.lookat,
@@ -66,6 +68,28 @@ def resolve_camera(
         azimuth=cfg.azimuth,
         elevation=cfg.elevation,
         fovy=cfg.fovy,
+    )
+
+
+def _view_of_model_camera(cfg: ViewerConfig, model: mujoco.MjModel) -> CameraView:
+    """Return the view of the camera `cfg.camera`, as it stands in the model's initial pose."""
+    names = [model.camera(i).name for i in range(model.ncam)]
+    if cfg.camera not in names:
+        raise ValueError(
+            f"The viewer's camera {cfg.camera!r} is not in the scene. Cameras there: {names}."
+        )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    camera_id = names.index(cfg.camera)
+    # A MuJoCo camera looks along its own -z axis.
+    forward = -data.cam_xmat[camera_id].reshape(3, 3)[:, 2]
+    return CameraView(
+        body_id=None,
+        lookat=tuple(data.cam_xpos[camera_id] + cfg.distance * forward),
+        distance=cfg.distance,
+        azimuth=float(np.rad2deg(np.arctan2(forward[1], forward[0]))),
+        elevation=float(np.rad2deg(np.arcsin(np.clip(forward[2], -1.0, 1.0)))),
+        fovy=float(model.cam_fovy[camera_id]),
     )
 
 

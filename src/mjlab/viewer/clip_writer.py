@@ -12,9 +12,15 @@ from typing import IO
 
 import numpy as np
 
+_CODECS = {
+    ".mp4": "-an -c:v libx264 -pix_fmt yuv420p -crf 20 -movflags +faststart",
+    # One palette for the whole clip keeps colours from flickering.
+    ".gif": "-an -vf split[a][b];[a]palettegen[p];[b][p]paletteuse",
+}
+
 
 class ClipWriter:
-    """Streams frames into an mp4 that appears under its name only once it is complete.
+    """Streams frames into an mp4 or gif that appears under its name only once it is complete.
 
     The file is finished by `close`, also when the program ends without calling it. Frames go to
     the encoder (the ffmpeg that the package imageio-ffmpeg brings) at once, so that a long clip
@@ -27,7 +33,12 @@ class ClipWriter:
         Args:
             path: Where the finished file goes; its folder is made if needed.
             fps: Frames per second of the clip.
+
+        Raises:
+            ValueError: The name does not end in .mp4 or .gif.
         """
+        if path.suffix not in _CODECS:
+            raise ValueError(f"{path.name!r} has to end in one of {', '.join(_CODECS)}.")
         self.path = path
         self.fps = fps
         self.num_frames = 0
@@ -91,13 +102,12 @@ class ClipWriter:
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115
         height, width = image.shape[:2]
         raw = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {self.fps:g} -i -"
-        coded = "-an -c:v libx264 -pix_fmt yuv420p -crf 20 -movflags +faststart"
         self._encoder = subprocess.Popen(
             [
                 imageio_ffmpeg.get_ffmpeg_exe(),
                 *("-loglevel", "error", "-y"),
                 *raw.split(),
-                *coded.split(),
+                *_CODECS[self.path.suffix].split(),
                 str(self._partial),
             ],
             stdin=subprocess.PIPE,

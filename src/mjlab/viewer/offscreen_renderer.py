@@ -73,7 +73,7 @@ class OffscreenRenderer:
         self._sim_model = sim_model
         self._expanded_fields = expanded_fields if expanded_fields is not None else set()
         self._view = resolve_camera(cfg, model, scene.entities)
-        self._model = _drawing_model(model, cfg)
+        self._model = _drawing_model(model, cfg, self._view.fovy)
         self._data = mujoco.MjData(self._model)
         self._option = _visibility(cfg)
         self._camera = mujoco.MjvCamera()
@@ -197,11 +197,11 @@ class OffscreenRenderer:
         return self._extra_envs
 
 
-def _drawing_model(model: mujoco.MjModel, cfg: ViewerConfig) -> mujoco.MjModel:
+def _drawing_model(model: mujoco.MjModel, cfg: ViewerConfig, fovy: float | None) -> mujoco.MjModel:
     private = host_model(model)
     private.stat.extent = max(_MIN_EXTENT, 1.5 * cfg.distance)
-    if cfg.fovy is not None:
-        private.vis.global_.fovy = cfg.fovy
+    if fovy is not None:
+        private.vis.global_.fovy = fovy
     private.vis.global_.offwidth = max(private.vis.global_.offwidth, cfg.width)
     private.vis.global_.offheight = max(private.vis.global_.offheight, cfg.height)
     # A shadow map much finer than the image costs most of the drawing time where a CPU draws.

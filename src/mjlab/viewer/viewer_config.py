@@ -59,3 +59,6 @@ class ViewerConfig:
     """Entity to follow; may be left out where the scene has exactly one."""
     body_name: str | None = None
     """Body to follow, without the entity's prefix."""
+    camera: str | None = None
+    """Camera of the model whose view to take instead, by its name in the scene
+    (`<entity>/<camera>`); None takes the view that the fields above describe."""

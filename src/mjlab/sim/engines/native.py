@@ -289,9 +289,7 @@ class NativeEngine(Engine):
 
     def copy_to_host(self, env_idx: int, mj_data: mujoco.MjData) -> None:
         state = self._batch.bind("state")[env_idx]
-        mujoco.mj_setState(
-            self._model, mj_data, state, int(mujoco.mjtState.mjSTATE_INTEGRATION)
-        )
+        mujoco.mj_setState(self._model, mj_data, state, int(mujoco.mjtState.mjSTATE_INTEGRATION))
         # Values written since the last call are not in the state row yet.
         for name in _INPUT_FIELDS & self._arrays.keys():
             value = self._arrays[name][env_idx]

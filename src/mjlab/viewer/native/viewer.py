@@ -74,11 +74,11 @@ class NativeMujocoViewer(BaseViewer):
         # Neighbours are posed in a model of their own, so that the window's is changed only
         # while it is locked.
         self._extra_model = host_model(unwrapped.sim.mj_model)
-        if self.cfg.fovy is not None:
-            self._model.vis.global_.fovy = self.cfg.fovy
         self._data = mujoco.MjData(self._model)
         self._extra_data = mujoco.MjData(self._extra_model)
         self._view = resolve_camera(self.cfg, self._model, unwrapped.scene.entities)
+        if self._view.fovy is not None:
+            self._model.vis.global_.fovy = self._view.fovy
         self._marked_body = (
             self._view.body_id if self._view.body_id is not None else first_moving_body(self._model)
         )

@@ -122,7 +122,7 @@ class ViserPlayViewer(BaseViewer):
         self._scene.env_idx = min(max(cfg.env_idx, 0), env.num_envs - 1)
         self._bind_drawn_fields()
         self._create_gui()
-        log.info("The viewer is at %s", self.url)
+        log.debug("The viewer is at %s", self.url)
 
     def is_running(self) -> bool:
         return not self._closed

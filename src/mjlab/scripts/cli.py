@@ -1,0 +1,204 @@
+"""What the command lines share: finding the task, parsing flags, and one clear message per error.
+
+Nothing heavy is imported here, so that `--help` and a mistyped task name answer at once.
+"""
+
+from __future__ import annotations
+
+import linecache
+import logging
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any, NoReturn, TypeVar
+
+C = TypeVar("C")
+
+TRACEBACK_VARIABLE = "MJLAB_TRACEBACK"
+
+
+class UserError(Exception):
+    """A mistake in what was asked for, told in one message."""
+
+
+def run_command(command: Callable[[list[str]], None]) -> NoReturn:
+    """Run `command` with the command line's arguments and exit.
+
+    An error that a user can mend is printed as one message, and the exit status is 1. Anything
+    else is a defect of the program and keeps its traceback.
+    """
+    # Scripts report to people: plain messages of the libraries, and warnings as one line each.
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
+    logging.getLogger("mjlab").setLevel(logging.INFO)
+    logging.captureWarnings(True)
+    warnings.formatwarning = _one_line  # ty: ignore[invalid-assignment]
+    try:
+        command(sys.argv[1:])
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:
+        # Whoever read the output (`| head`) has seen enough. What is still buffered has nowhere
+        # to go, and Python would complain about it at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except Exception as error:
+        if not isinstance(error, _user_errors()) and not _raised_on_purpose(error):
+            raise
+        if os.environ.get(TRACEBACK_VARIABLE):
+            traceback.print_exc()
+        print(f"error: {_text(error)}", file=sys.stderr)
+        print(f"(Set {TRACEBACK_VARIABLE}=1 for where it came from.)", file=sys.stderr)
+        sys.exit(1)
+    sys.exit(0)
+
+
+def _one_line(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    line: str | None = None,
+) -> str:
+    return f"{category.__name__}: {message}"
+
+
+def _user_errors() -> tuple[type[BaseException], ...]:
+    from mjlab.tasks.registry import UnknownTaskError
+
+    errors: list[type[BaseException]] = [UserError, UnknownTaskError, ValueError, OSError]
+    # Classes of modules that were never imported cannot have been raised.
+    for module_name, class_name in (
+        ("mjlab.sim.engine", "EngineUnavailableError"),
+        ("mjlab.rl.checkpoint", "CheckpointError"),
+        ("mjlab.viewer.errors", "RenderingUnavailableError"),
+    ):
+        module = sys.modules.get(module_name)
+        if module is not None:
+            errors.append(getattr(module, class_name))
+    return tuple(errors)
+
+
+def _raised_on_purpose(error: BaseException) -> bool:
+    """Return whether `error` is a message of ours, such as a KeyError for an unknown entity.
+
+    Errors of other kinds than a user can mend are defects, unless a `raise` statement of this
+    package made them: then their text says what is wrong with a task.
+    """
+    frames = list(traceback.walk_tb(error.__traceback__))
+    if not frames or isinstance(error, AssertionError):
+        return False
+    frame, number = frames[-1]
+    line = linecache.getline(frame.f_code.co_filename, number)
+    ours = frame.f_globals.get("__name__", "").startswith("mjlab.")
+    return ours and line.lstrip().startswith("raise ")
+
+
+def _text(error: BaseException) -> str:
+    # A KeyError shows its text in quotes.
+    text = str(error.args[0] if isinstance(error, KeyError) and error.args else error).strip()
+    return text if text else type(error).__name__
+
+
+def tell(message: str) -> None:
+    """Print a notice for people. Standard output is left to what the command is asked for."""
+    print(message, file=sys.stderr, flush=True)
+
+
+def task_and_flags(argv: list[str], usage: str) -> tuple[str, list[str]]:
+    """Split the command line into the task's name, which comes first, and its flags.
+
+    Without arguments, or with only `--help`, prints `usage` and exits.
+
+    Raises:
+        UnknownTaskError: no such task; the message lists the nearest names.
+        UserError: flags before the task.
+    """
+    if not argv or argv[0] in ("-h", "--help"):
+        print(usage)
+        sys.exit(0)
+    if argv[0].startswith("-"):
+        raise UserError(f"The task's name comes first, before {argv[0]!r}.\n\n{usage}")
+    from mjlab.tasks.registry import require_task
+
+    require_task(argv[0])
+    return argv[0], argv[1:]
+
+
+def parse_flags(config_type: type[C], default: C, flags: list[str], prog: str) -> C:
+    """Return `default` with the fields replaced that `flags` name; exits on an unknown flag.
+
+    `--env.rewards.<term> None`, and the like for every other kind of term, switches the term off.
+    """
+    import tyro
+
+    import mjlab
+    from mjlab.scripts.switch_off import switch_terms_off
+
+    edited, flags = switch_terms_off(default, flags)
+    return tyro.cli(
+        config_type,
+        default=edited,
+        args=_with_explicit_switches(config_type, flags),
+        prog=prog,
+        config=mjlab.TYRO_FLAGS,
+    )
+
+
+def _with_explicit_switches(config_type: Any, flags: list[str]) -> list[str]:
+    """Read a bare `--video` as `--video True`, for the switches of `config_type` itself."""
+    switches = {
+        "--" + field.name.replace("_", "-")
+        for field in fields(config_type)
+        if field.type in ("bool", bool)
+    }
+    explicit: list[str] = []
+    for position, flag in enumerate(flags):
+        explicit.append(flag)
+        following = flags[position + 1] if position + 1 < len(flags) else None
+        bare = following is None or following.startswith("--")
+        if flag.replace("_", "-") in switches and bare:
+            explicit.append("True")
+    return explicit
+
+
+def resolve_device(device: str | None) -> str:
+    """Return the torch device to use: the one asked for, else a GPU where there is one.
+
+    Raises:
+        UserError: a CUDA device without a usable GPU, or a name that torch does not know.
+    """
+    import torch
+
+    if device is None:
+        return "cuda:0" if torch.cuda.is_available() else "cpu"
+    try:
+        kind = torch.device(device).type
+    except RuntimeError as error:
+        raise UserError(
+            f"{device!r} is not a device. Use cpu, cuda, or cuda:0, cuda:1, ..."
+        ) from error
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise UserError(
+            f"--device {device} was asked for, but torch finds no CUDA GPU here "
+            f"(torch {torch.__version__}). Use --device cpu, or install a driver and a CUDA build "
+            "of torch."
+        )
+    return "cuda:0" if device == "cuda" else device
+
+
+def task_usage(name: str, purpose: str, examples: list[str]) -> str:
+    """Return the short help that is printed when no task is named."""
+    lines = [f"usage: {name} TASK [flags]", "", purpose, ""]
+    lines += ["examples:", *(f"    uv run {example}" for example in examples), ""]
+    lines += [
+        f"`{name} TASK --help` lists every flag of the task; `list-envs` lists the tasks.",
+    ]
+    return "\n".join(lines)
+
+
+def chosen(value: Any, default: Any) -> Any:
+    """Return `value`, or `default` where nothing was given."""
+    return default if value is None else value

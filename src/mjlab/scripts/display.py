@@ -1,0 +1,135 @@
+"""What a person sees while a policy trains: one live panel, or plain lines where no terminal is."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TYPE_CHECKING
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.panel import Panel
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.table import Table
+
+from mjlab.rl.progress import IterationStats, TrainingObserver
+
+if TYPE_CHECKING:
+    from mjlab.rl.evaluate import EvaluationResult
+
+# Plain lines are for log files: often enough to follow, rarely enough to read.
+_SECONDS_BETWEEN_LINES = 5.0
+
+
+class TrainingDisplay(TrainingObserver):
+    """Shows progress, time left, speed, reward and episode length, updated every iteration."""
+
+    def __init__(self, title: str, console: Console | None = None) -> None:
+        self._console = console or Console()
+        self._title = title
+        self._live: Live | None = None
+        self._progress = Progress(
+            TextColumn("iteration"),
+            BarColumn(bar_width=None),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[left]} left"),
+        )
+        self._last_line = float("-inf")
+        self._started = time.perf_counter()
+
+    def on_start(self, first_iteration: int, total_iterations: int) -> None:
+        """Begin the panel; `first_iteration` iterations were done before."""
+        self._started = time.perf_counter()
+        self._bar = self._progress.add_task(
+            "", total=total_iterations, completed=first_iteration, left="?"
+        )
+        if self._console.is_terminal:
+            self._live = Live(self._progress, console=self._console, refresh_per_second=8)
+            self._live.start()
+
+    def on_iteration(self, stats: IterationStats) -> None:
+        """Show the figures of an iteration."""
+        left = duration(stats.time_left)
+        self._progress.update(self._bar, completed=stats.iteration, left=left)
+        if self._live is not None:
+            self._live.update(self._panel(stats))
+            return
+        now = time.perf_counter()
+        last = stats.iteration == stats.total_iterations
+        if last or now - self._last_line >= _SECONDS_BETWEEN_LINES:
+            self._last_line = now
+            self._console.print(_line(stats), highlight=False, soft_wrap=True)
+
+    def on_evaluation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
+        """Tell how an evaluation went."""
+        verdict = "solved" if solved else "not solved yet"
+        self._console.print(
+            f"Evaluation after {iteration} iterations: mean return {result.mean_return:.1f} over "
+            f"{result.num_episodes} episodes, {verdict}.",
+            highlight=False,
+        )
+
+    def on_stop_requested(self, signal_name: str) -> None:
+        """Tell that a signal arrived and what happens now."""
+        self._console.print(
+            f"{signal_name}: finishing this iteration, then saving. Once more to stop at once.",
+            highlight=False,
+        )
+
+    def on_end(self, reason: str) -> None:
+        """Close the panel."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+        spent = duration(time.perf_counter() - self._started)
+        self._console.print(f"Training {reason} after {spent}.", highlight=False)
+        sys.stdout.flush()
+
+    def _panel(self, stats: IterationStats) -> Panel:
+        table = Table.grid(padding=(0, 3))
+        for _ in range(4):
+            table.add_column()
+        cells = _cells(stats)
+        for first, second in zip(cells[::2], cells[1::2], strict=True):
+            table.add_row(first[0], first[1], second[0], second[1])
+        return Panel(Group(self._progress, table), title=self._title, title_align="left")
+
+
+def _cells(stats: IterationStats) -> list[tuple[str, str]]:
+    return [
+        ("steps per second", f"{stats.steps_per_second:,.0f}"),
+        ("steps in total", f"{stats.total_steps:,}"),
+        ("collection", f"{stats.collection_time:.3f} s"),
+        ("learning", f"{stats.learning_time:.3f} s"),
+        ("mean reward", _figure(stats.mean_reward)),
+        ("mean episode length", _figure(stats.mean_episode_length)),
+        ("mean step reward", f"{stats.mean_step_reward:.3f}"),
+        ("action noise", f"{stats.action_std:.3f}"),
+    ]
+
+
+def _line(stats: IterationStats) -> str:
+    return (
+        f"[{stats.iteration}/{stats.total_iterations}] "
+        f"{stats.steps_per_second:,.0f} steps/s "
+        f"(collection {stats.collection_time:.2f} s, learning {stats.learning_time:.2f} s), "
+        f"mean reward {_figure(stats.mean_reward)}, "
+        f"episode length {_figure(stats.mean_episode_length)}, "
+        f"step reward {stats.mean_step_reward:.3f}, "
+        f"{duration(stats.time_left)} left"
+    ).replace("[", r"\[", 1)
+
+
+def _figure(value: float | None) -> str:
+    return "none finished yet" if value is None else f"{value:.2f}"
+
+
+def duration(seconds: float) -> str:
+    """Return seconds as a person writes them: `8.4 s`, `3:05 min`, `2:10 h`."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes}:{rest:02d} min"
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d} h"

@@ -1,0 +1,38 @@
+"""List the registered tasks."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from mjlab.scripts.cli import run_command
+
+
+def list_environments(keyword: str | None = None) -> list[str]:
+    """Return the names of all tasks that contain `keyword`, whatever the case."""
+    from mjlab.tasks.registry import list_tasks
+
+    wanted = (keyword or "").lower()
+    return [name for name in list_tasks() if wanted in name.lower()]
+
+
+def _command(argv: list[str]) -> None:
+    parser = argparse.ArgumentParser(prog="list-envs", description="List the registered tasks.")
+    parser.add_argument("--keyword", help="show only tasks whose name contains this")
+    args = parser.parse_args(argv)
+    names = list_environments(args.keyword)
+    if not names:
+        print(f"No task's name contains {args.keyword!r}.", file=sys.stderr)
+        sys.exit(1)
+    width = len(str(len(names)))
+    for number, name in enumerate(names, start=1):
+        print(f"{number:>{width}}  {name}")
+
+
+def main() -> None:
+    """Entry point of `list-envs` and `list_envs`: exits 0, or 1 if nothing matches."""
+    run_command(_command)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,163 @@
+"""Showing a policy: which one, where, and for how long."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from mjlab.scripts.cli import UserError, resolve_device
+from mjlab.scripts.policy import (
+    constant_policy,
+    find_checkpoint,
+    load_policy,
+    make_env,
+    without_terminations,
+)
+
+
+@dataclass
+class PlayConfig:
+    """Flags of `play`."""
+
+    agent: Literal["zero", "random", "trained"] = "trained"
+    """Who acts: all-zero actions, uniform ones in [-1, 1], or a trained policy."""
+    wandb_run_path: str | None = None
+    """Weights & Biases run to take the policy from, as entity/project/run."""
+    wandb_checkpoint_name: str | None = None
+    """Checkpoint of that run; None takes the newest."""
+    checkpoint_file: str | None = None
+    """Checkpoint to play; None takes the newest of the task."""
+    num_envs: int | None = None
+    """Number of environments; None keeps the task's."""
+    device: str | None = None
+    """Torch device; None takes a GPU where there is one."""
+    engine: Literal["auto", "native", "warp"] | None = None
+    """Physics engine."""
+    video: bool = False
+    """Record a clip instead of opening a viewer."""
+    video_length: int = 200
+    """Frames of the clip."""
+    video_format: Literal["mp4", "gif"] = "mp4"
+    """Format of the clip."""
+    video_height: int | None = None
+    """Height of the clip, in pixels."""
+    video_width: int | None = None
+    """Width of the clip, in pixels."""
+    camera: int | str | None = None
+    """Camera of the model to record from, by name or index; None is the task's own view."""
+    viewer: Literal["auto", "native", "viser", "none"] = "auto"
+    """`viser` is a page in the browser, `native` is MuJoCo's window, `none` steps without looking.
+    `auto` takes the window where there is a display, else the page."""
+    num_steps: int | None = None
+    """Environment steps to take; None plays until stopped."""
+    host: str = "127.0.0.1"
+    """Address that the page is served on; 0.0.0.0 serves the whole network."""
+    port: int = 8080
+    """Port that the page is served on."""
+    no_terminations: bool = False
+    """Switch off every termination, the time limit included."""
+    log_root: str = "logs/rsl_rl"
+    """Folder of all runs."""
+
+
+def run_play(task: str, cfg: PlayConfig) -> None:
+    """Play `task` as `cfg` says.
+
+    Raises:
+        UserError, ValueError, OSError, CheckpointError, EngineUnavailableError,
+        RenderingUnavailableError: what was asked for cannot be done.
+    """
+    if cfg.num_steps is not None and cfg.num_steps < 1:
+        raise UserError(f"--num-steps is {cfg.num_steps}; it has to be at least 1.")
+    if cfg.viewer == "none" and cfg.num_steps is None and not cfg.video:
+        raise UserError("--viewer none needs --num-steps, because nothing else would end it.")
+    device = resolve_device(cfg.device)
+    checkpoint = None
+    if cfg.agent == "trained":
+        checkpoint = find_checkpoint(
+            task,
+            cfg.log_root,
+            cfg.checkpoint_file,
+            cfg.wandb_run_path,
+            cfg.wandb_checkpoint_name,
+        )
+    if cfg.video:
+        _record(task, cfg, checkpoint, device)
+        return
+    edit = without_terminations if cfg.no_terminations else None
+    env = make_env(task, device, cfg.num_envs, cfg.engine, edit=edit)
+    print(f"Physics:    {env.unwrapped.sim.capabilities.description}")
+    try:
+        policy = _policy(task, cfg, env, checkpoint, device)
+        if cfg.viewer == "none" and cfg.num_steps is not None:
+            _play_headless(env, policy, cfg.num_steps)
+        else:
+            viewer = _make_viewer(task, cfg, env, policy, checkpoint, device)
+            viewer.run(num_steps=cfg.num_steps)
+    finally:
+        env.close()
+
+
+def _policy(task: str, cfg: PlayConfig, env: Any, checkpoint: Path | None, device: str) -> Any:
+    if checkpoint is None:
+        return constant_policy(env, cfg.agent)
+    return load_policy(task, env, checkpoint, device)
+
+
+def _play_headless(env: Any, policy: Any, num_steps: int) -> None:
+    from mjlab.viewer.headless import run_headless
+
+    result = run_headless(env, policy, num_steps)
+    print(
+        f"{result.num_steps} steps in {env.num_envs} environments, {result.num_episodes} episodes "
+        f"ended, mean reward per step {result.mean_step_reward:.4f}"
+    )
+
+
+def _make_viewer(
+    task: str, cfg: PlayConfig, env: Any, policy: Any, checkpoint: Path | None, device: str
+) -> Any:
+    has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    native = cfg.viewer == "native" or (cfg.viewer == "auto" and has_display)
+    if native:
+        from mjlab.viewer import NativeMujocoViewer
+
+        return NativeMujocoViewer(env, policy)
+    from mjlab.viewer import ViserPlayViewer
+    from mjlab.viewer.viser.checkpoints import LocalCheckpoints
+
+    source = None
+    if checkpoint is not None:
+        source = LocalCheckpoints(
+            checkpoint.parent,
+            lambda path: load_policy(task, env, path, device),
+            current=checkpoint.name,
+        )
+    viewer = ViserPlayViewer(env, policy, checkpoints=source, host=cfg.host, port=cfg.port)
+    print(f"Open {viewer.url} in a browser. Ctrl-C ends.")
+    return viewer
+
+
+def _record(task: str, cfg: PlayConfig, checkpoint: Path | None, device: str) -> None:
+    from mjlab.scripts.record import VideoCfg, record_policy
+
+    folder = Path("videos") if checkpoint is None else checkpoint.parent / "videos" / "play"
+    record_policy(
+        task,
+        checkpoint,
+        folder,
+        device,
+        VideoCfg(
+            length=cfg.num_steps or cfg.video_length,
+            suffix=cfg.video_format,
+            height=cfg.video_height,
+            width=cfg.video_width,
+            camera=cfg.camera,
+            num_envs=cfg.num_envs,
+            engine=cfg.engine,
+            agent=cfg.agent,
+            no_terminations=cfg.no_terminations,
+        ),
+    )

@@ -1,0 +1,117 @@
+"""Finding and loading a trained policy, for `play`, `evaluate` and recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mjlab.scripts.cli import UserError, tell
+from mjlab.scripts.run_folder import named_checkpoint, newest_checkpoint, read_agent_params
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnvCfg
+
+# Entries of the learner's config that say what the networks are and which observations they get.
+_NETWORKS = ("actor", "critic", "obs_groups")
+
+
+def load_policy(task: str, env: Any, checkpoint: Path, device: str) -> Any:
+    """Return the deterministic policy in `checkpoint`, for the wrapped environment `env`.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, or holds another network.
+    """
+    from mjlab.rl import MjlabOnPolicyRunner
+
+    runner_cls: Any = load_runner_cls(task) or MjlabOnPolicyRunner
+    runner = runner_cls(env, _agent_cfg(task, checkpoint), None, device)
+    runner.load(str(checkpoint), load_cfg={"actor": True}, strict=True, map_location=device)
+    return runner.get_inference_policy(device=device)
+
+
+def _agent_cfg(task: str, checkpoint: Path) -> dict[str, Any]:
+    """Return the learner's config of `task`, with the networks that the checkpoint's run had.
+
+    The command line may have given them other sizes than the task does.
+    """
+    cfg = asdict(load_rl_cfg(task))
+    saved = read_agent_params(checkpoint.parent)
+    return cfg | {name: saved[name] for name in _NETWORKS if name in saved and name in cfg}
+
+
+def find_checkpoint(
+    task: str,
+    log_root: str,
+    checkpoint_file: str | None,
+    wandb_run_path: str | None,
+    wandb_checkpoint_name: str | None,
+) -> Path:
+    """Return the checkpoint that the flags name, or the newest one of the task.
+
+    Raises:
+        UserError: there is none.
+    """
+    if checkpoint_file is not None:
+        return named_checkpoint(Path(checkpoint_file), task)
+    experiment = Path(log_root).resolve() / load_rl_cfg(task).experiment_name
+    if wandb_run_path is not None:
+        from mjlab.utils.os import get_wandb_checkpoint_path
+
+        return get_wandb_checkpoint_path(experiment, Path(wandb_run_path), wandb_checkpoint_name)[0]
+    path = newest_checkpoint(experiment, task)
+    if path is None:
+        raise UserError(
+            f"No checkpoint was named, and {experiment} has none of {task}. Run `train {task}` "
+            "first, or give --checkpoint-file or --wandb-run-path."
+        )
+    tell(f"Checkpoint: {path}")
+    return path
+
+
+def constant_policy(env: Any, kind: str) -> Any:
+    """Return a policy that does not look: `zero` actions, or `random` ones in [-1, 1]."""
+    import torch
+
+    shape = (env.num_envs, env.num_actions)
+    if kind == "zero":
+        zeros = torch.zeros(shape, device=env.device)
+        return lambda observations: zeros
+    return lambda observations: 2.0 * torch.rand(shape, device=env.device) - 1.0
+
+
+def make_env(
+    task: str,
+    device: str,
+    num_envs: int | None = None,
+    engine: Any = None,
+    *,
+    play: bool = True,
+    seed: int | None = None,
+    render_mode: str | None = None,
+    edit: Callable[[ManagerBasedRlEnvCfg], None] | None = None,
+) -> Any:
+    """Return the wrapped environment of the task's play or training config.
+
+    What is None is left as the task has it; `edit` may change the config further.
+    """
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.rl import RslRlVecEnvWrapper
+
+    cfg = load_env_cfg(task, play=play)
+    cfg.seed = seed
+    if num_envs is not None:
+        cfg.scene.num_envs = num_envs
+    if engine is not None:
+        cfg.sim.engine = engine
+    if edit is not None:
+        edit(cfg)
+    env = ManagerBasedRlEnv(cfg, device=device, render_mode=render_mode)
+    return RslRlVecEnvWrapper(env, clip_actions=load_rl_cfg(task).clip_actions)
+
+
+def without_terminations(cfg: ManagerBasedRlEnvCfg) -> None:
+    """Switch off every termination of `cfg`, the time limit included."""
+    cfg.terminations = {}

@@ -1,0 +1,85 @@
+"""Recording a policy into a video, without a viewer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from mjlab.scripts.policy import (
+    constant_policy,
+    load_policy,
+    make_env,
+    without_terminations,
+)
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnvCfg
+
+
+@dataclass(frozen=True)
+class VideoCfg:
+    """What a recording looks like."""
+
+    length: int = 200
+    """Frames, one an environment step."""
+    height: int | None = None
+    """Height in pixels; None keeps the task's."""
+    width: int | None = None
+    """Width in pixels; None keeps the task's."""
+    suffix: Literal["mp4", "gif"] = "mp4"
+    """Format of the file."""
+    camera: int | str | None = None
+    """Camera of the model, by name or index; None is the task's own view."""
+    num_envs: int | None = None
+    """Number of environments; None keeps the task's."""
+    engine: Any = None
+    """Physics engine; None keeps the task's."""
+    agent: str = "trained"
+    """Who acts where there is no checkpoint: `zero` or `random`."""
+    no_terminations: bool = False
+    """Whether terminations are switched off."""
+
+
+def record_policy(
+    task: str,
+    checkpoint: Path | None,
+    folder: Path,
+    device: str,
+    video: VideoCfg | None = None,
+) -> Path | None:
+    """Record one clip into `folder` and return its path.
+
+    Raises:
+        RenderingUnavailableError: this machine cannot render; the message says what to install.
+    """
+    import torch
+
+    from mjlab.viewer.clip_writer import ClipWriter
+
+    video = video or VideoCfg()
+
+    def edit(cfg: ManagerBasedRlEnvCfg) -> None:
+        cfg.viewer.height = video.height or cfg.viewer.height
+        cfg.viewer.width = video.width or cfg.viewer.width
+        if video.no_terminations:
+            without_terminations(cfg)
+
+    env = make_env(task, device, video.num_envs, video.engine, render_mode="rgb_array", edit=edit)
+    try:
+        if checkpoint is None:
+            policy, name = constant_policy(env, video.agent), video.agent
+        else:
+            policy, name = load_policy(task, env, checkpoint, device), checkpoint.stem
+        writer = ClipWriter(
+            folder / f"{task}-{name}.{video.suffix}", env.unwrapped.metadata["render_fps"]
+        )
+        with torch.inference_mode():
+            for _ in range(video.length):
+                env.step(policy(env.get_observations()))
+                writer.add(env.unwrapped.render(video.camera))
+        path = writer.close()
+    finally:
+        env.close()
+    print(f"Video: {path}")
+    return path

@@ -1,0 +1,101 @@
+"""What a run folder says about its run, and finding checkpoints in such folders."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from mjlab.scripts.cli import UserError, tell
+
+_INFO_FILE = "run.json"
+_CHECKPOINT = re.compile(r"model_(\d+)\.pt")
+
+
+def write_run_info(run_dir: Path, **info: Any) -> None:
+    """Add entries to what `run_dir` says about its run (`run.json`)."""
+    path = run_dir / _INFO_FILE
+    text = json.dumps({**read_run_info(run_dir), **info}, indent=2)
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(text + "\n")
+    temporary.replace(path)
+
+
+def read_run_info(run_dir: Path) -> dict[str, Any]:
+    """Return what `run_dir` says about its run; nothing if it says nothing readable."""
+    try:
+        info = json.loads((run_dir / _INFO_FILE).read_text())
+    except (OSError, ValueError):
+        return {}
+    return info if isinstance(info, dict) else {}
+
+
+def read_agent_params(run_dir: Path) -> dict[str, Any]:
+    """Return the learner's config that a run was made with; empty if the folder does not say."""
+    import yaml
+
+    try:
+        params = yaml.safe_load((run_dir / "params" / "agent.yaml").read_text())
+    except (OSError, ValueError, yaml.YAMLError):
+        return {}
+    return params if isinstance(params, dict) else {}
+
+
+def checkpoints_in(run_dir: Path) -> list[Path]:
+    """Return the checkpoints of a run, oldest iteration first."""
+    named = (path for path in run_dir.glob("model_*.pt") if _CHECKPOINT.fullmatch(path.name))
+    return sorted(named, key=_number)
+
+
+def _number(checkpoint: Path) -> int:
+    return int(checkpoint.stem.removeprefix("model_"))
+
+
+def newest_checkpoint(experiment: Path, task: str) -> Path | None:
+    """Return the last checkpoint of the newest run of `task` that has one."""
+    for run_dir in _runs(experiment):
+        # Runs that do not name their task were made by other tools, and may be of this one.
+        if read_run_info(run_dir).get("task", task) == task:
+            checkpoints = checkpoints_in(run_dir)
+            if checkpoints:
+                return checkpoints[-1]
+    return None
+
+
+def named_checkpoint(path: Path, task: str) -> Path:
+    """Return the checkpoint at `path`, which may leave out the run's folder.
+
+    `logs/rsl_rl/cartpole/model_500.pt` is then that file of the newest run of `task`, or the last
+    checkpoint of that run if it ended, solved or finished, before it got so far.
+
+    Raises:
+        UserError: there is no such file; the message lists what there is.
+    """
+    if path.is_file():
+        return path
+    match = _CHECKPOINT.fullmatch(path.name)
+    newest = newest_checkpoint(path.parent, task) if match else None
+    if match and newest:
+        sibling = newest.parent / path.name
+        if sibling.is_file():
+            return sibling
+        ended = read_run_info(newest.parent).get("ended")
+        if ended in ("solved", "finished") and int(match.group(1)) > _number(newest):
+            tell(f"The newest run was {ended} before {path.name}. Its last checkpoint: {newest}")
+            return newest
+    raise UserError(_missing(path, task))
+
+
+def _runs(experiment: Path) -> list[Path]:
+    """Return the run folders of an experiment, newest first (their names begin with the time)."""
+    if not experiment.is_dir():
+        return []
+    return sorted((path for path in experiment.iterdir() if path.is_dir()), reverse=True)
+
+
+def _missing(path: Path, task: str) -> str:
+    folders = [path.parent, *_runs(path.parent)[:1]]
+    there = [str(file) for folder in folders for file in checkpoints_in(folder)[-3:]]
+    hint = f" There are: {', '.join(there)}." if there else f" `train {task}` makes some."
+    return f"There is no checkpoint {path}.{hint}"

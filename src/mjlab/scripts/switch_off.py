@@ -1,0 +1,89 @@
+"""Switching terms off from the command line: `--env.rewards.smooth-reward None`.
+
+A term that is None is off. tyro has no flag for a whole config inside a dict, only for its fields,
+so these flags are taken out of the command line before tyro reads it.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping
+from dataclasses import is_dataclass
+from typing import Any, TypeVar
+
+C = TypeVar("C")
+
+# Fields that hold terms by name. Observation terms are below their group, as `terms`.
+_TERM_DICTS = frozenset(
+    (
+        "observations",
+        "terms",
+        "actions",
+        "rewards",
+        "terminations",
+        "events",
+        "commands",
+        "curriculum",
+        "metrics",
+        "recorders",
+    )
+)
+
+
+def switch_terms_off(default: C, flags: list[str]) -> tuple[C, list[str]]:
+    """Return `default` without the terms that `flags` set to None, and the remaining flags.
+
+    Flags that name no term of `default` remain, for tyro to judge. `default` itself stays as it is.
+    """
+    config = copy.deepcopy(default)
+    remaining: list[str] = []
+    for flag, value, words in _flag_values(flags):
+        holder, name = _term_at(config, flag) if value == "None" else (None, "")
+        if holder is None:
+            remaining += words
+        else:
+            holder[name] = None
+    return config, remaining
+
+
+def _flag_values(flags: list[str]) -> Iterator[tuple[str, str | None, list[str]]]:
+    """Yield every flag with its value, and the words that it was made of.
+
+    `--flag value` and `--flag=value` mean the same; values after the first are words of their own.
+    """
+    position = 0
+    while position < len(flags):
+        word = flags[position]
+        flag, equals, value = word.partition("=")
+        if equals:
+            yield flag, value, [word]
+        elif word.startswith("--") and flags[position + 1 : position + 2] == ["None"]:
+            yield word, "None", [word, "None"]
+            position += 1
+        else:
+            yield word, None, [word]
+        position += 1
+
+
+def _term_at(config: Any, flag: str) -> tuple[dict[str, Any] | None, str]:
+    """Return the dict that holds the term named by `flag`, and its key; (None, "") if none does."""
+    if not flag.startswith("--"):
+        return None, ""
+    holder: Any = None
+    value, key, inside = config, "", ""
+    for part in flag.removeprefix("--").split("."):
+        inside, holder = key, value
+        names = list(holder) if isinstance(holder, Mapping) else list(vars(holder))
+        matching = [name for name in names if _spelled_alike(name, part)]
+        if not matching:
+            return None, ""
+        key = matching[0]
+        value = holder[key] if isinstance(holder, Mapping) else getattr(holder, key)
+        if not is_dataclass(value) and not isinstance(value, Mapping):
+            return None, ""
+    return (holder, key) if isinstance(holder, dict) and inside in _TERM_DICTS else (None, "")
+
+
+def _spelled_alike(name: Any, part: str) -> bool:
+    # tyro writes `smooth_reward` as `smooth-reward` and takes both.
+    return isinstance(name, str) and name.replace("_", "-") == part.replace("_", "-")

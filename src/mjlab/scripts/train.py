@@ -1,0 +1,48 @@
+"""Train a task: `uv run train TASK [flags]`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from mjlab.scripts.cli import run_command, task_and_flags, task_usage
+
+if TYPE_CHECKING:
+    from mjlab.scripts.train_run import TrainConfig as TrainConfig
+
+_USAGE = task_usage(
+    "train",
+    "Train a policy with PPO. Checkpoints, curves and the exported policy go to "
+    "logs/rsl_rl/<experiment>/<time>/.",
+    [
+        "train Mjlab-Cartpole-Swingup --num-envs 4096",
+        "train Mjlab-Cartpole-Swingup --agent.algorithm.learning-rate 3e-4 --agent.seed 1",
+        "train Mjlab-Cartpole-Swingup --agent.resume True",
+    ],
+)
+
+
+def __getattr__(name: str) -> Any:
+    # The parts behind the command line load torch; the command line itself does not.
+    if name in ("TrainConfig", "launch_training", "run_train"):
+        from mjlab.scripts import train_run
+
+        return getattr(train_run, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def _command(argv: list[str]) -> None:
+    task, flags = task_and_flags(argv, _USAGE)
+    from mjlab.scripts.cli import parse_flags
+    from mjlab.scripts.train_run import TrainConfig, launch_training
+
+    cfg = parse_flags(TrainConfig, TrainConfig.from_task(task), flags, prog=f"train {task}")
+    launch_training(task, cfg)
+
+
+def main() -> None:
+    """Entry point of `train`."""
+    run_command(_command)
+
+
+if __name__ == "__main__":
+    main()

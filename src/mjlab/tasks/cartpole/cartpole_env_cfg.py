@@ -1,0 +1,250 @@
+"""The cartpole tasks: swing a pole up by pushing its cart, or keep it balanced.
+
+A cart slides on a rail and carries a pole on a hinge. The agent pushes the cart. Model and reward
+are those of the DeepMind Control Suite (Tassa et al., 2018, https://arxiv.org/abs/1801.00690).
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import mujoco
+import torch
+
+from mjlab.actuator import XmlActuatorCfg
+from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.envs.mdp import (
+    JointEffortActionCfg,
+    joint_pos_rel,
+    joint_vel_rel,
+    reset_joints_by_offset,
+    time_out,
+)
+from mjlab.managers import (
+    EventTermCfg,
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    RewardTermCfg,
+    SceneEntityCfg,
+    TerminationTermCfg,
+)
+from mjlab.rl.config import (
+    EvaluationCfg,
+    RslRlModelCfg,
+    RslRlOnPolicyRunnerCfg,
+    RslRlPpoAlgorithmCfg,
+)
+from mjlab.scene import SceneCfg
+from mjlab.sim import MujocoCfg, SimulationCfg
+from mjlab.terrains import TerrainEntityCfg
+from mjlab.viewer import ViewerConfig
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+    from mjlab.envs import ManagerBasedRlEnv
+
+# The model.
+
+_CARTPOLE_XML = Path(__file__).parent / "cartpole.xml"
+
+
+def _get_spec() -> mujoco.MjSpec:
+    return mujoco.MjSpec.from_file(str(_CARTPOLE_XML))
+
+
+# The motor of the XML is used as it is.
+_ARTICULATION = EntityArticulationInfoCfg(
+    actuators=(XmlActuatorCfg(target_names_expr=("slider",)),),
+)
+
+_SWINGUP_INIT = EntityCfg.InitialStateCfg(
+    joint_pos={"slider": 0.0, "hinge_1": math.pi},
+    joint_vel={".*": 0.0},
+)
+
+_BALANCE_INIT = EntityCfg.InitialStateCfg(
+    joint_pos={"slider": 0.0, "hinge_1": 0.0},
+    joint_vel={".*": 0.0},
+)
+
+
+def _get_cartpole_cfg(swing_up: bool) -> EntityCfg:
+    return EntityCfg(
+        spec_fn=_get_spec,
+        articulation=_ARTICULATION,
+        init_state=_SWINGUP_INIT if swing_up else _BALANCE_INIT,
+    )
+
+
+# Terms of its own.
+
+
+def _joint(name: str) -> SceneEntityCfg:
+    return SceneEntityCfg("cartpole", joint_names=(name,))
+
+
+_CART = _joint("slider")
+_HINGE = _joint("hinge_1")
+
+
+def pole_angle_cos_sin(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _HINGE) -> torch.Tensor:
+    """Return cosine and sine of the hinge angle, (N, 2).
+
+    The angle of a hinge without limits grows with every turn; these repeat.
+    """
+    asset: Entity = env.scene[asset_cfg.name]
+    angle = asset.data.joint_pos[:, asset_cfg.joint_ids]
+    return torch.cat([torch.cos(angle), torch.sin(angle)], dim=-1)
+
+
+def _gaussian_tolerance(x: torch.Tensor, margin: float) -> torch.Tensor:
+    """Return 1 at x = 0, falling along a Gaussian to 0.1 at |x| = margin."""
+    return torch.exp(math.log(0.1) * torch.square(x / margin))
+
+
+def _quadratic_tolerance(x: torch.Tensor, margin: float) -> torch.Tensor:
+    """Return 1 at x = 0, falling along a parabola to 0 at |x| = margin, and 0 beyond."""
+    return (1.0 - torch.square(x / margin)).clamp(min=0.0)
+
+
+def cartpole_smooth_reward(
+    env: ManagerBasedRlEnv,
+    cart_cfg: SceneEntityCfg = _CART,
+    hinge_cfg: SceneEntityCfg = _HINGE,
+) -> torch.Tensor:
+    """Return the control suite's smooth cartpole reward, (N,) in [0, 1].
+
+    With hinge angle t, cart position x, control u and Gaussian and quadratic tolerances g and q:
+
+        r = (cos t + 1) / 2 * (1 + g(x)) / 2 * (4 + q(u)) / 5 * (1 + g(dt/ds)) / 2
+
+    g is 0.1 at 2 m and at 5 rad/s; q is 0 at |u| = 1. As a product, the reward is high only while
+    the pole is upright, the cart centred, the control small and the pole still, all at once.
+    """
+    asset: Entity = env.scene[cart_cfg.name]
+    cart_pos = asset.data.joint_pos[:, cart_cfg.joint_ids].squeeze(-1)
+    control = asset.data.joint_effort_target[:, cart_cfg.joint_ids].squeeze(-1)
+    pole_angle = asset.data.joint_pos[:, hinge_cfg.joint_ids].squeeze(-1)
+    pole_vel = asset.data.joint_vel[:, hinge_cfg.joint_ids].squeeze(-1)
+
+    upright = (torch.cos(pole_angle) + 1.0) / 2.0
+    centered = (1.0 + _gaussian_tolerance(cart_pos, margin=2.0)) / 2.0
+    small_control = (4.0 + _quadratic_tolerance(control, margin=1.0)) / 5.0
+    small_velocity = (1.0 + _gaussian_tolerance(pole_vel, margin=5.0)) / 2.0
+    return upright * centered * small_control * small_velocity
+
+
+# The environments.
+
+
+def _observations(corrupted: bool) -> dict[str, ObservationGroupCfg | None]:
+    def terms() -> dict[str, ObservationTermCfg | None]:
+        return {
+            "cart_pos": ObservationTermCfg(
+                func=joint_pos_rel, params={"asset_cfg": _joint("slider")}
+            ),
+            "pole_angle": ObservationTermCfg(
+                func=pole_angle_cos_sin, params={"asset_cfg": _joint("hinge_1")}
+            ),
+            "cart_vel": ObservationTermCfg(
+                func=joint_vel_rel, params={"asset_cfg": _joint("slider")}
+            ),
+            "pole_vel": ObservationTermCfg(
+                func=joint_vel_rel, params={"asset_cfg": _joint("hinge_1")}
+            ),
+        }
+
+    return {
+        "actor": ObservationGroupCfg(terms(), enable_corruption=corrupted),
+        "critic": ObservationGroupCfg(terms()),
+    }
+
+
+def _reset_events(slider_range: tuple[float, float]) -> dict[str, EventTermCfg | None]:
+    def reset(joint: str, position_range: tuple[float, float]) -> EventTermCfg:
+        return EventTermCfg(
+            func=reset_joints_by_offset,
+            mode="reset",
+            params={
+                "position_range": position_range,
+                "velocity_range": (-0.01, 0.01),
+                "asset_cfg": _joint(joint),
+            },
+        )
+
+    return {
+        "reset_slider": reset("slider", slider_range),
+        "reset_hinge": reset("hinge_1", (-0.034, 0.034)),
+    }
+
+
+def _make_env_cfg(swing_up: bool, play: bool) -> ManagerBasedRlEnvCfg:
+    return ManagerBasedRlEnvCfg(
+        scene=SceneCfg(
+            terrain=TerrainEntityCfg(terrain_type="plane"),
+            entities={"cartpole": _get_cartpole_cfg(swing_up)},
+            num_envs=1,
+            env_spacing=4.0,
+        ),
+        observations=_observations(corrupted=not play),
+        actions={
+            "effort": JointEffortActionCfg(
+                entity_name="cartpole", actuator_names=("slider",), scale=1.0
+            ),
+        },
+        events=_reset_events(slider_range=(0.0, 0.0) if swing_up else (-0.1, 0.1)),
+        rewards={
+            "smooth_reward": RewardTermCfg(
+                func=cartpole_smooth_reward,
+                weight=1.0,
+                params={"cart_cfg": _joint("slider"), "hinge_cfg": _joint("hinge_1")},
+            ),
+        },
+        terminations={"time_out": TerminationTermCfg(func=time_out, time_out=True)},
+        sim=SimulationCfg(mujoco=MujocoCfg(timestep=0.01, disableflags=("contact",))),
+        viewer=ViewerConfig(
+            origin_type=ViewerConfig.OriginType.ASSET_BODY,
+            entity_name="cartpole",
+            body_name="cart",
+            distance=4.0,
+            elevation=-15.0,
+            azimuth=0.0,
+            camera="cartpole/side",
+        ),
+        decimation=5,
+        # Who plays decides when it is over.
+        episode_length_s=1e10 if play else 50.0,
+    )
+
+
+def cartpole_swingup_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
+    """Return the swing-up task: the pole starts hanging down."""
+    return _make_env_cfg(swing_up=True, play=play)
+
+
+def cartpole_balance_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
+    """Return the balance task: the pole starts upright."""
+    return _make_env_cfg(swing_up=False, play=play)
+
+
+def cartpole_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
+    """Return the PPO settings of both tasks."""
+    return RslRlOnPolicyRunnerCfg(
+        actor=RslRlModelCfg(
+            hidden_dims=(64, 64),
+            distribution_cfg={
+                "class_name": "GaussianDistribution",
+                "init_std": 1.0,
+                "std_type": "scalar",
+            },
+        ),
+        critic=RslRlModelCfg(hidden_dims=(64, 64)),
+        algorithm=RslRlPpoAlgorithmCfg(entropy_coef=0.01),
+        experiment_name="cartpole",
+        num_steps_per_env=32,
+        max_iterations=500,
+        evaluation=EvaluationCfg(solved_return=900.0),
+    )

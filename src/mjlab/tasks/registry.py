@@ -1,0 +1,160 @@
+"""Tasks by name.
+
+A task is registered with its configs, or, so that listing tasks costs nothing, with the name of
+the functions that make them. Tasks come from the folders of `mjlab.tasks` and from installed
+packages that declare an entry point in the group `mjlab.tasks`; they are discovered when the
+registry is first asked.
+"""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import importlib
+import inspect
+import logging
+import pkgutil
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnvCfg
+    from mjlab.rl.config import RslRlBaseRunnerCfg
+
+logger = logging.getLogger(__name__)
+
+ENTRY_POINT_GROUP = "mjlab.tasks"
+
+
+class UnknownTaskError(KeyError):
+    """Raised for a task name that is not registered; the message lists the nearest ones."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+@dataclass(frozen=True)
+class _Task:
+    env_cfg: Any
+    play_env_cfg: Any
+    rl_cfg: Any
+    runner_cls: Any
+
+
+_tasks: dict[str, _Task] = {}
+_discovered = False
+
+
+def register_mjlab_task(
+    task_id: str,
+    env_cfg: ManagerBasedRlEnvCfg | Callable[..., ManagerBasedRlEnvCfg] | str,
+    play_env_cfg: ManagerBasedRlEnvCfg | Callable[..., ManagerBasedRlEnvCfg] | str | None = None,
+    rl_cfg: RslRlBaseRunnerCfg | Callable[[], RslRlBaseRunnerCfg] | str | None = None,
+    runner_cls: type | str | None = None,
+) -> None:
+    """Register a task under `task_id`.
+
+    Args:
+        task_id: the name, unique, such as `Mjlab-Cartpole-Swingup`.
+        env_cfg: the config to train with: a config, a function that makes it, or the function's
+            name as `module:function`, which is imported when the task is first used.
+        play_env_cfg: the config to play with, likewise. None calls the function of `env_cfg`,
+            with `play=True` if it takes that, or reuses its config.
+        rl_cfg: the config of the learner, likewise.
+        runner_cls: the runner class or its name as `module:Class`; None takes the default.
+
+    Raises:
+        ValueError: the name is taken, or `rl_cfg` is missing.
+    """
+    if task_id in _tasks:
+        raise ValueError(f"A task named {task_id!r} is registered already; choose another name.")
+    if rl_cfg is None:
+        raise ValueError(f"Task {task_id!r} needs an rl_cfg (an RslRlOnPolicyRunnerCfg).")
+    _tasks[task_id] = _Task(env_cfg, play_env_cfg, rl_cfg, runner_cls)
+
+
+def list_tasks() -> list[str]:
+    """Return the names of all tasks, sorted."""
+    _discover()
+    return sorted(_tasks)
+
+
+def load_env_cfg(task_name: str, play: bool = False) -> ManagerBasedRlEnvCfg:
+    """Return a copy of the environment config of a task, to train or to `play` with."""
+    task = _find(task_name)
+    if not play:
+        return _made(task.env_cfg)
+    if task.play_env_cfg is not None:
+        return _made(task.play_env_cfg)
+    return _made(task.env_cfg, play=True)
+
+
+def load_rl_cfg(task_name: str) -> RslRlBaseRunnerCfg:
+    """Return a copy of the learner's config of a task."""
+    return _made(_find(task_name).rl_cfg)
+
+
+def load_runner_cls(task_name: str) -> type | None:
+    """Return the runner class of a task, or None for the default one."""
+    runner_cls = _find(task_name).runner_cls
+    return _imported(runner_cls) if isinstance(runner_cls, str) else runner_cls
+
+
+def require_task(task_name: str) -> None:
+    """Raise UnknownTaskError, listing the nearest names, unless the task is registered."""
+    _find(task_name)
+
+
+def _find(task_name: str) -> _Task:
+    _discover()
+    if task_name not in _tasks:
+        near = difflib.get_close_matches(task_name, _tasks, n=3, cutoff=0.4)
+        hint = f" Did you mean {' or '.join(near)}?" if near else ""
+        raise UnknownTaskError(
+            f"Unknown task {task_name!r}.{hint} `list-envs` shows all {len(_tasks)} tasks."
+        )
+    return _tasks[task_name]
+
+
+def _made(source: Any, **kwargs: Any) -> Any:
+    """Return a fresh config from a config, a function, or a function's name."""
+    if isinstance(source, str):
+        source = _imported(source)
+    if callable(source):
+        taken = inspect.signature(source).parameters
+        kwargs = {name: value for name, value in kwargs.items() if name in taken}
+    # What a function returns is copied too, because it may be put together from module constants.
+    return copy.deepcopy(source(**kwargs) if callable(source) else source)
+
+
+def _imported(name: str) -> Any:
+    module, _, attribute = name.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def _discover() -> None:
+    """Import, once, whatever registers tasks. What fails is reported and skipped."""
+    global _discovered
+    if _discovered:
+        return
+    _discovered = True
+    import mjlab.tasks
+
+    for module in pkgutil.iter_modules(mjlab.tasks.__path__, "mjlab.tasks."):
+        if module.ispkg:
+            importlib.import_module(module.name)
+    for entry_point in entry_points(group=ENTRY_POINT_GROUP):
+        try:
+            entry_point.load()
+        # A broken package must not take the others down with it, not even one that exits.
+        except (Exception, SystemExit):
+            logger.error(
+                "Tasks of the package behind entry point %r (%s) are skipped, because it fails to "
+                "import:\n%s",
+                entry_point.name,
+                entry_point.value,
+                traceback.format_exc().rstrip(),
+            )

@@ -1,0 +1,76 @@
+"""Running the commands within the test's own process."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import logging
+import sys
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+
+TASK = "Mjlab-Cartpole-Swingup"
+SMALL = [
+    "--num-envs", "16", "--device", "cpu", "--agent.num-steps-per-env", "8", "--agent.seed", "7",
+    "--agent.save-interval", "1",
+]  # fmt: skip
+
+
+@dataclass
+class Outcome:
+    """How a command ended."""
+
+    status: int
+    out: str
+    err: str
+
+    @property
+    def message(self) -> str:
+        """The one error message of a command that failed."""
+        lines = [line for line in self.err.splitlines() if line.startswith("error: ")]
+        assert len(lines) == 1, self.err
+        return self.err[self.err.index("error: ") :]
+
+
+@contextlib.contextmanager
+def _kept_process_settings() -> Iterator[None]:
+    """Put back what a command sets for its process: logging, warnings and torch's threads."""
+    root, package = logging.getLogger(), logging.getLogger("mjlab")
+    handlers, levels = list(root.handlers), (root.level, package.level)
+    form, threads = warnings.formatwarning, torch.get_num_threads()
+    try:
+        yield
+    finally:
+        logging.captureWarnings(False)
+        root.handlers[:] = handlers
+        root.setLevel(levels[0])
+        package.setLevel(levels[1])
+        warnings.formatwarning = form
+        torch.set_num_threads(threads)
+
+
+def run_script(script: str, *argv: str) -> Outcome:
+    """Run `script` (a module of mjlab.scripts) with `argv`, as the command line does."""
+    main = importlib.import_module(f"mjlab.scripts.{script}").main
+    out, err = io.StringIO(), io.StringIO()
+    before = sys.argv
+    sys.argv = [script, *argv]
+    try:
+        with (
+            _kept_process_settings(),
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+        ):
+            # Otherwise messages would go to the handlers of the test runner.
+            logging.getLogger().handlers.clear()
+            main()
+    except SystemExit as ended:
+        status = ended.code
+    finally:
+        sys.argv = before
+    assert isinstance(status, int)
+    return Outcome(status, out.getvalue(), err.getvalue())

@@ -1,0 +1,54 @@
+"""Fixtures of the command tests."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from commands import SMALL, TASK, Outcome, run_script
+
+
+@pytest.fixture(scope="session")
+def run() -> Callable[..., Outcome]:
+    """Return a function that runs a command."""
+    return run_script
+
+
+@pytest.fixture(scope="session")
+def train(run) -> Callable[..., Path]:
+    """Return a function that trains a little and returns the run's folder."""
+
+    def train(log_root: Path, iterations: int, *flags: str) -> Path:
+        experiment = log_root / "cartpole"
+        before = set(experiment.iterdir()) if experiment.is_dir() else set()
+        argv = [TASK, *SMALL, "--log-root", str(log_root)]
+        outcome = run("train", *argv, "--agent.max-iterations", str(iterations), *flags)
+        assert outcome.status == 0, outcome.err
+        (run_dir,) = set(experiment.iterdir()) - before
+        return run_dir
+
+    return train
+
+
+@pytest.fixture(scope="session")
+def trained(train, tmp_path_factory) -> Path:
+    """Return the folder of a finished run of two iterations; not to be changed."""
+    return train(tmp_path_factory.mktemp("trained") / "logs", 2)
+
+
+@pytest.fixture(scope="session")
+def gl() -> None:
+    """Skip where this machine cannot render offscreen."""
+    from mjlab.viewer.errors import RenderingUnavailableError
+    from mjlab.viewer.gl_context import open_renderer
+
+    try:
+        open_renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
+    except RenderingUnavailableError as error:
+        pytest.skip(str(error))

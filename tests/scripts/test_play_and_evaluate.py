@@ -1,0 +1,169 @@
+"""`play` and `evaluate`: which policy, for how long, and what is printed."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from mjlab.scripts.cli import parse_flags
+from mjlab.scripts.evaluate import EvaluateConfig
+from mjlab.scripts.play import PlayConfig
+
+TASK = "Mjlab-Cartpole-Swingup"
+HEADLESS = ("--viewer", "none", "--num-steps", "5", "--num-envs", "3", "--device", "cpu")
+SHORT = ("--num-episodes", "4", "--max-steps", "6", "--device", "cpu")
+
+
+@pytest.mark.parametrize("agent", ["zero", "random"])
+def test_an_agent_that_does_not_look_plays_without_a_checkpoint(run, agent):
+    outcome = run("play", TASK, "--agent", agent, *HEADLESS)
+    assert outcome.status == 0, outcome.err
+    assert "5 steps in 3 environments" in outcome.out
+
+
+def test_the_newest_policy_is_played_unless_one_is_named(run, trained):
+    log_root = str(trained.parents[1])
+    outcome = run("play", TASK, *HEADLESS, "--log-root", log_root)
+    assert outcome.status == 0, outcome.err
+    assert str(trained / "model_1.pt") in outcome.err
+    outcome = run("play", TASK, *HEADLESS, "--checkpoint-file", str(trained / "model_0.pt"))
+    assert outcome.status == 0, outcome.err
+
+
+def test_the_tutorials_path_finds_the_newest_run(run, trained):
+    # The run was finished with model_1, as a solved one would be before model_500.
+    named = trained.parent / "model_500.pt"
+    outcome = run("play", TASK, *HEADLESS, "--checkpoint-file", str(named))
+    assert outcome.status == 0, outcome.err
+    assert str(trained / "model_1.pt") in outcome.err
+
+
+def test_a_policy_of_weights_and_biases_is_played(run, trained, monkeypatch):
+    asked = []
+
+    def fetch(experiment, run_path, name):
+        asked.append((str(run_path), name))
+        return trained / "model_1.pt", True
+
+    monkeypatch.setattr("mjlab.utils.os.get_wandb_checkpoint_path", fetch)
+    outcome = run("play", TASK, *HEADLESS, "--wandb-run-path", "me/project/abc")
+    assert outcome.status == 0, outcome.err
+    assert asked == [("me/project/abc", None)]
+
+
+def test_a_policy_with_networks_from_the_command_line_is_played(run, train, tmp_path):
+    run_dir = train(tmp_path, 1, "--agent.actor.hidden-dims", "(8,)")
+    outcome = run("play", TASK, *HEADLESS, "--checkpoint-file", str(run_dir / "model_0.pt"))
+    assert outcome.status == 0, outcome.err
+
+
+def test_without_terminations_no_episode_ends(run, monkeypatch):
+    from mjlab.tasks.cartpole import cartpole_env_cfg
+
+    make = cartpole_env_cfg._make_env_cfg
+
+    def short(swing_up, play):
+        cfg = make(swing_up, play)
+        cfg.episode_length_s = 0.1
+        return cfg
+
+    monkeypatch.setattr(cartpole_env_cfg, "_make_env_cfg", short)
+    ended = run("play", TASK, "--agent", "zero", *HEADLESS).out
+    endless = run("play", TASK, "--agent", "zero", *HEADLESS, "--no-terminations").out
+    assert "6 episodes ended" in ended
+    assert "0 episodes ended" in endless
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (("--viewer", "none"), "--num-steps"),
+        (("--viewer", "none", "--num-steps", "0"), "--num-steps is 0"),
+        ((*HEADLESS, "--num-envs", "0"), "num_envs is 0"),
+        ((*HEADLESS, "--device", "gpu"), "'gpu'"),
+    ],
+)
+def test_what_cannot_be_played_is_refused(run, flags, named):
+    outcome = run("play", TASK, "--agent", "zero", *flags)
+    assert outcome.status == 1
+    assert named in outcome.message
+
+
+@pytest.mark.parametrize("script", ["play", "evaluate"])
+def test_without_any_checkpoint_the_message_says_what_to_do(run, script, tmp_path):
+    outcome = run(script, TASK, "--log-root", str(tmp_path), "--device", "cpu")
+    assert outcome.status == 1
+    for part in (str(tmp_path / "cartpole"), f"`train {TASK}`", "--checkpoint-file"):
+        assert part in outcome.message
+
+
+def test_a_clip_is_recorded_beside_the_checkpoint(run, trained, tmp_path, gl):
+    run_dir = shutil.copytree(trained, tmp_path / "run")
+    outcome = run(
+        "play", TASK, "--video", "--viewer", "none", "--num-steps", "3", "--device", "cpu",
+        "--video-height", "48", "--video-width", "64",
+        "--checkpoint-file", str(run_dir / "model_1.pt"),
+    )  # fmt: skip
+    assert outcome.status == 0, outcome.err
+    (clip,) = (run_dir / "videos" / "play").glob("*.mp4")
+    assert clip.stat().st_size > 0
+    assert f"Video: {clip}" in outcome.out
+
+
+def test_evaluation_prints_figures_for_machines_and_nothing_else(run, trained):
+    outcome = run("evaluate", TASK, *SHORT, "--json", "--log-root", str(trained.parents[1]))
+    assert outcome.status == 0, outcome.err
+    figures = json.loads(outcome.out)
+    assert figures["task"] == TASK
+    assert figures["policy"] == str(trained / "model_1.pt")
+    assert figures["num_episodes"] == 4
+    low, high = figures["return_interval"]
+    assert low <= figures["mean_return"] <= high
+    assert figures["success_rate"] == 0.0
+
+
+def test_evaluation_prints_a_table_for_people(run, trained):
+    outcome = run("evaluate", TASK, *SHORT, "--log-root", str(trained.parents[1]))
+    assert outcome.status == 0, outcome.err
+    for part in ("Mean return", "95 % interval", "Success      0.0%", "at least 900", "native"):
+        assert part in outcome.out
+
+
+def test_the_same_seed_gives_the_same_figures_and_another_does_not(run):
+    def figures(seed: int) -> float:
+        argv = ("--agent", "random", "--json", "--seed", str(seed))
+        return json.loads(run("evaluate", TASK, *SHORT, *argv).out)["mean_return"]
+
+    assert figures(1) == figures(1)
+    assert figures(1) != figures(2)
+
+
+def test_no_episodes_are_refused(run):
+    outcome = run("evaluate", TASK, "--agent", "zero", "--num-episodes", "0")
+    assert outcome.status == 1
+    assert "--num-episodes is 0" in outcome.message
+
+
+@pytest.mark.parametrize(
+    ("config_type", "flags", "field", "value"),
+    [
+        (PlayConfig, ["--num-envs", "4"], "num_envs", 4),
+        (PlayConfig, ["--checkpoint-file", "a/model_500.pt"], "checkpoint_file", "a/model_500.pt"),
+        (PlayConfig, ["--wandb-run-path", "a/b/c"], "wandb_run_path", "a/b/c"),
+        (PlayConfig, ["--engine", "warp"], "engine", "warp"),
+        (PlayConfig, ["--viewer", "viser"], "viewer", "viser"),
+        (PlayConfig, ["--camera", "1"], "camera", 1),
+        (PlayConfig, ["--camera", "cartpole/side"], "camera", "cartpole/side"),
+        (PlayConfig, ["--video"], "video", True),
+        (EvaluateConfig, ["--json"], "json", True),
+        (EvaluateConfig, ["--device", "cuda:1"], "device", "cuda:1"),
+    ],
+)
+def test_flags_reach_their_fields(config_type, flags, field, value):
+    assert getattr(parse_flags(config_type, config_type(), flags, "x"), field) == value
+
+
+def test_the_page_is_served_to_this_machine_only_unless_told_otherwise():
+    assert PlayConfig().host == "127.0.0.1"
