@@ -338,7 +338,7 @@ def test_delay_line_survives_capture_and_restore(make_world):
 
 
 def test_older_delayed_config_puts_its_delay_on_the_config_it_wraps(make_world):
-    with pytest.warns(DeprecationWarning, match="is an older name"):
+    with pytest.warns(FutureWarning, match="is an older name"):
         from mjlab.actuator import DelayedActuator, DelayedActuatorCfg
     from mjlab.actuator.delayed_actuator import DelayedActuatorCfg as SameCfg
 

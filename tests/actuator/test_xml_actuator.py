@@ -105,7 +105,7 @@ def test_older_names_stand_for_the_one_that_detects_the_kind():
     from mjlab import actuator
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
+        warnings.simplefilter("ignore", FutureWarning)
         for kind in ("Motor", "Position", "Velocity", "Muscle"):
             assert getattr(actuator, f"Xml{kind}ActuatorCfg") is XmlActuatorCfg
             assert getattr(actuator.xml_actuator, f"Xml{kind}ActuatorCfg") is XmlActuatorCfg

@@ -223,7 +223,7 @@ def test_a_function_may_learn_its_field_from_its_params(env):
 
 
 def test_the_field_of_older_releases_is_accepted():
-    with pytest.warns(DeprecationWarning, match="domain_randomization"):
+    with pytest.warns(FutureWarning, match="domain_randomization"):
         cfg = EventTermCfg(func=Calls(), mode="startup", domain_randomization=True)
     assert cfg.mode == "startup"
 

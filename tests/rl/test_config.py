@@ -52,7 +52,7 @@ def test_configs_do_not_share_their_parts():
 
 def test_older_noise_fields_become_a_distribution():
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
+        warnings.simplefilter("ignore", FutureWarning)
         cfg = RslRlModelCfg(stochastic=True, init_noise_std=0.5, noise_std_type="log")
     assert cfg.distribution_cfg == {
         "class_name": "GaussianDistribution",

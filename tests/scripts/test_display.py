@@ -22,6 +22,7 @@ STATS = IterationStats(
     mean_reward=12.5,
     mean_episode_length=None,
     mean_step_reward=0.125,
+    learning_rate=1e-3,
     action_std=0.75,
     time_left=65.0,
 )

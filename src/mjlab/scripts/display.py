@@ -126,7 +126,7 @@ def _figure(value: float | None) -> str:
 
 def duration(seconds: float) -> str:
     """Return seconds as a person writes them: `8.4 s`, `3:05 min`, `2:10 h`."""
-    if seconds < 60:
+    if round(seconds, 1) < 60:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
     if minutes < 60:

@@ -13,7 +13,7 @@ from mjlab.envs.mdp.dr import older
 from mjlab.managers.event_manager import EventTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning")
 
 
 def test_randomize_field_as_an_event_declares_and_recomputes(make_world: Any) -> None:

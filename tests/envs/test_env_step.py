@@ -1,0 +1,339 @@
+"""One environment step: its order, its resets, its seeds, and what it refuses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg, mdp
+from mjlab.managers import (
+    EventTermCfg,
+    MetricsTermCfg,
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    RewardTermCfg,
+    TerminationTermCfg,
+)
+from mjlab.tasks.registry import load_env_cfg
+
+NUM_ENVS = 6
+
+
+def cartpole(edit: Callable[[ManagerBasedRlEnvCfg], None] | None = None) -> ManagerBasedRlEnvCfg:
+    cfg = load_env_cfg("Mjlab-Cartpole-Swingup")
+    cfg.scene.num_envs, cfg.seed, cfg.sim.engine = NUM_ENVS, 5, "native"
+    if edit is not None:
+        edit(cfg)
+    return cfg
+
+
+@pytest.fixture
+def make():
+    """Return a function that makes an environment, reset and ready to step."""
+    made: list[ManagerBasedRlEnv] = []
+
+    def make(edit: Callable[[ManagerBasedRlEnvCfg], None] | None = None) -> ManagerBasedRlEnv:
+        env = ManagerBasedRlEnv(cartpole(edit), device="cpu")
+        made.append(env)
+        env.reset()
+        return env
+
+    yield make
+    for env in made:
+        env.close()
+
+
+def actions(steps: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return 2.0 * torch.rand(steps, NUM_ENVS, 1, generator=generator) - 1.0
+
+
+def run(env: ManagerBasedRlEnv, steps: int) -> torch.Tensor:
+    rows = []
+    for action in actions(steps):
+        observations, reward, terminated, truncated, _ = env.step(action)
+        flags = (terminated[:, None].float(), truncated[:, None].float())
+        rows.append(torch.cat([observations["actor"], reward[:, None], *flags], dim=1))
+    return torch.stack(rows)
+
+
+def joint_pos(env: Any) -> torch.Tensor:
+    return env.sim.data.qpos[:, 0].clone()
+
+
+def cart_pos(env: Any) -> torch.Tensor:
+    """The cart's place along the rail, which is derived from the joint's."""
+    body = env.sim.mj_model.body("cartpole/cart").id
+    return env.sim.data.xpos[:, body, 0].clone()
+
+
+# The order.
+
+
+def test_the_parts_of_a_step_come_in_their_order(make):
+    calls: list[str] = []
+
+    def log(name: str, value: Callable[[Any], Any]) -> Callable[..., Any]:
+        def term(env, env_ids=None):
+            calls.append(name)
+            return value(env)
+
+        return term
+
+    def zeros(env):
+        return torch.zeros(env.num_envs)
+
+    def edit(cfg):
+        cfg.terminations["t"] = TerminationTermCfg(func=log("termination", lambda e: zeros(e) > 0))
+        cfg.rewards["r"] = RewardTermCfg(func=log("reward", zeros), weight=1.0)
+        cfg.metrics["m"] = MetricsTermCfg(func=log("metric", zeros))
+        cfg.events["s"] = EventTermCfg(func=log("step event", lambda e: None), mode="step")
+        cfg.events["e"] = EventTermCfg(func=log("reset event", lambda e: None), mode="reset")
+        observed = ObservationTermCfg(func=log("observation", lambda e: zeros(e)[:, None]))
+        cfg.observations["extra"] = ObservationGroupCfg(terms={"o": observed})
+
+    env = make(edit)
+    calls.clear()
+    env.step(actions(1)[0])
+    assert calls == ["termination", "reward", "metric", "step event", "observation"]
+    calls.clear()
+    env.episode_length_buf[:] = env.max_episode_length - 1
+    env.step(actions(1)[0])
+    assert calls == [
+        "termination", "reward", "metric", "step event", "reset event", "observation",
+    ]  # fmt: skip
+
+
+def test_rewards_read_derived_quantities_one_substep_old_and_observations_current_ones(make):
+    def edit(cfg):
+        cfg.rewards = {
+            "joint": RewardTermCfg(func=joint_pos, weight=1.0),
+            "body": RewardTermCfg(func=cart_pos, weight=1.0),
+        }
+        terms = {
+            "joint": ObservationTermCfg(func=lambda env: joint_pos(env)[:, None]),
+            "body": ObservationTermCfg(func=lambda env: cart_pos(env)[:, None]),
+        }
+        cfg.observations["extra"] = ObservationGroupCfg(terms=terms)
+        cfg.scale_rewards_by_dt = False
+
+    env = make(edit)
+    for action in actions(4):
+        observations, *_ = env.step(action)
+        joint, body = (env.reward_manager._step_reward[:, index] for index in range(2))
+        velocity = env.sim.data.qvel[:, 0]
+        assert (joint != body).any()
+        # One substep at the velocity of the end, because the integrator is semi-implicit.
+        torch.testing.assert_close(joint - body, velocity * env.physics_dt, atol=2e-6, rtol=1e-4)
+        current = observations["extra"]
+        torch.testing.assert_close(current[:, 0], current[:, 1], atol=1e-6, rtol=0)
+
+
+def test_one_dispatch_for_all_substeps_gives_the_bits_of_one_for_each(make):
+    together = make()
+    assert together._steps_as_one
+    one_by_one = make()
+    one_by_one._steps_as_one = False
+    assert torch.equal(run(together, 8), run(one_by_one, 8))
+
+
+def test_a_metric_that_looks_between_substeps_changes_nothing_else(make):
+    seen: list[float] = []
+
+    def look(env):
+        seen.append(float(env.sim.data.qvel[0, 0]))
+        return torch.zeros(env.num_envs)
+
+    plain = run(make(), 3)
+    env = make(lambda cfg: cfg.metrics.update(m=MetricsTermCfg(func=look, per_substep=True)))
+    assert not env._steps_as_one
+    seen.clear()
+    assert torch.equal(run(env, 3), plain)
+    assert len(seen) == 3 * env.cfg.decimation
+    assert len(set(seen)) == len(seen), "every call has to see another substep"
+
+
+# Episodes.
+
+
+def test_a_time_limit_truncates_and_a_failure_terminates(make):
+    def edit(cfg):
+        cfg.episode_length_s = 0.15
+        failed = lambda env: env.episode_length_buf * (torch.arange(NUM_ENVS) == 2) == 2  # noqa: E731
+        cfg.terminations["failed"] = TerminationTermCfg(func=failed)
+
+    env = make(edit)
+    expected = torch.zeros(3, NUM_ENVS)
+    expected[1, 2] = 1
+    rows = run(env, 3)
+    assert torch.equal(rows[:, :, -2], expected)
+    expected = torch.zeros(3, NUM_ENVS)
+    expected[2] = 1
+    expected[2, 2] = 0
+    assert torch.equal(rows[:, :, -1], expected)
+
+
+def test_an_environment_that_is_done_starts_anew_in_the_same_step(make):
+    env = make()
+    run(env, 5)
+    env.episode_length_buf[3] = env.max_episode_length - 1
+    observations, _, _, truncated, extras = env.step(actions(1)[0])
+    assert truncated.tolist() == [False] * 3 + [True] + [False] * 2
+    assert env.episode_length_buf.tolist() == [6, 6, 6, 0, 6, 6]
+    # What is observed belongs to the new episode: the cart in the middle, the pole hanging.
+    assert observations["actor"][3, 0] == 0.0
+    assert observations["actor"][3, 1].item() == pytest.approx(-1.0, abs=1e-3)
+    assert any(name.startswith("Episode_") for name in extras["log"])
+
+
+def test_without_auto_reset_an_environment_that_is_done_has_to_be_reset_by_hand(make):
+    env = make(lambda cfg: setattr(cfg, "auto_reset", False))
+    env.episode_length_buf[3] = env.max_episode_length - 1
+    before = env.sim.data.qpos[3].clone()
+    _, _, _, truncated, _ = env.step(actions(1)[0])
+    assert truncated[3]
+    assert env.episode_length_buf[3] == env.max_episode_length
+    assert not torch.equal(env.sim.data.qpos[3], before), "its last state is there to be read"
+    with pytest.raises(
+        RuntimeError, match=r"Environments \[3\] are done .*reset\(env_ids=\.\.\.\)"
+    ):
+        env.step(actions(1)[0])
+    env.reset(env_ids=torch.tensor([3]))
+    env.step(actions(1)[0])
+    assert env.episode_length_buf.tolist() == [2, 2, 2, 1, 2, 2]
+
+
+@pytest.mark.parametrize(
+    "ids", [torch.tensor([1, 4]), torch.tensor([False, True, False, False, True, False])]
+)
+def test_environments_to_reset_are_indices_or_a_mask(make, ids):
+    env = make()
+    run(env, 3)
+    env.reset(env_ids=ids)
+    assert env.episode_length_buf.tolist() == [3, 0, 3, 3, 0, 3]
+
+
+@settings(max_examples=200)
+@given(steps=st.integers(1, 5000), decimation=st.integers(1, 20), timestep=st.integers(1, 20))
+def test_an_episode_has_as_many_steps_as_its_length_says(steps, decimation, timestep):
+    class Env:
+        step_dt = decimation * (timestep / 1000)
+        max_episode_length_s = steps * (decimation * timestep / 1000)
+
+    length = ManagerBasedRlEnv.max_episode_length.fget(Env())  # ty: ignore
+    assert length == steps
+    Env.max_episode_length_s += 0.5 * Env.step_dt
+    assert ManagerBasedRlEnv.max_episode_length.fget(Env()) == steps + 1  # ty: ignore
+
+
+# Rewards.
+
+
+def test_rewards_are_scaled_by_the_duration_of_a_step_unless_told_otherwise(make):
+    scaled = run(make(), 4)[:, :, 5]
+    plain = run(make(lambda cfg: setattr(cfg, "scale_rewards_by_dt", False)), 4)[:, :, 5]
+    torch.testing.assert_close(scaled, plain * 0.05)
+
+
+@pytest.mark.parametrize("kind", ["rewards", "terminations", "events", "metrics", "commands"])
+def test_a_term_that_is_none_is_off(make, kind):
+    def edit(cfg):
+        getattr(cfg, kind)["off"] = None
+
+    assert torch.equal(run(make(edit), 3), run(make(), 3))
+
+
+# Seeds.
+
+
+def test_a_seed_that_was_not_given_is_drawn_and_kept():
+    env = ManagerBasedRlEnv(cartpole(lambda cfg: setattr(cfg, "seed", None)), device="cpu")
+    assert isinstance(env.cfg.seed, int)
+    env.close()
+
+
+def test_the_bits_do_not_depend_on_the_number_of_physics_threads(make):
+    runs = [run(make(lambda cfg, n=n: setattr(cfg.sim, "num_threads", n)), 6) for n in (1, 2, 3)]
+    assert torch.equal(runs[0], runs[1])
+    assert torch.equal(runs[0], runs[2])
+
+
+def test_an_environment_alone_moves_as_among_others(make):
+    def keep_still(cfg):
+        cfg.events = {"reset": EventTermCfg(func=mdp.reset_scene_to_default, mode="reset")}
+
+    def alone(cfg):
+        keep_still(cfg)
+        cfg.scene.num_envs = 1
+
+    among = make(keep_still)
+    single = make(alone)
+    for action in actions(5):
+        many = among.step(action)[0]["actor"]
+        one = single.step(action[:1])[0]["actor"]
+        assert torch.equal(many[:1], one)
+
+
+# What is refused, and what is described.
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (lambda cfg: setattr(cfg.scene, "num_envs", 0), "scene.num_envs is 0"),
+        (lambda cfg: setattr(cfg.scene, "num_envs", -4), "scene.num_envs is -4"),
+        (lambda cfg: setattr(cfg, "decimation", 0), "decimation is 0"),
+        (lambda cfg: setattr(cfg.sim.mujoco, "timestep", 0.0), "timestep is 0.0"),
+        (lambda cfg: setattr(cfg.sim.mujoco, "timestep", math.nan), "timestep is nan"),
+        (lambda cfg: setattr(cfg, "episode_length_s", -1.0), "episode_length_s is -1.0"),
+        (lambda cfg: setattr(cfg, "episode_length_s", 0.0), "'time_out' would fire at every step"),
+        (lambda cfg: setattr(cfg.sim, "engine", "magic"), "Unknown engine 'magic'"),
+        (lambda cfg: setattr(cfg.sim, "num_threads", -1), "num_threads"),
+    ],
+)
+def test_a_config_that_cannot_work_is_refused_by_name(edit, words):
+    with pytest.raises(ValueError, match=words):
+        ManagerBasedRlEnv(cartpole(edit), device="cpu")
+
+
+def test_a_config_without_terms_is_an_environment_that_only_moves():
+    cfg = cartpole()
+    bare = ManagerBasedRlEnvCfg(decimation=2, scene=cfg.scene, seed=1, episode_length_s=1.0)
+    env = ManagerBasedRlEnv(bare, device="cpu")
+    env.reset()
+    _, reward, terminated, truncated, _ = env.step(torch.zeros(NUM_ENVS, 0))
+    assert (reward == 0).all()
+    assert not (terminated | truncated).any()
+    env.close()
+
+
+def test_spaces_have_the_shapes_of_what_is_returned(make):
+    env = make()
+    observations, *_ = env.step(actions(1)[0])
+    for name, group in observations.items():
+        assert env.observation_space.spaces[name].shape == group.shape
+        assert env.single_observation_space.spaces[name].shape == group.shape[1:]
+    assert env.action_space.shape == (NUM_ENVS, 1)
+    assert env.metadata["render_fps"] == pytest.approx(20.0)
+    assert env.unwrapped is env
+
+
+def test_without_a_render_mode_there_is_no_image_and_an_unknown_one_is_refused(make):
+    assert make().render() is None
+    env = ManagerBasedRlEnv(cartpole(), device="cpu", render_mode="hologram")
+    with pytest.raises(NotImplementedError, match=r"'hologram'.*'rgb_array'"):
+        env.render()
+    env.close()
+
+
+def test_the_state_of_another_number_of_environments_is_refused(make):
+    state = make().state_dict()
+    other = make(lambda cfg: setattr(cfg.scene, "num_envs", 2))
+    with pytest.raises(ValueError, match=f"of {NUM_ENVS} environments; this run has 2"):
+        other.load_state_dict(state)
