@@ -325,15 +325,24 @@ def test_a_log_folder_that_cannot_be_written_is_told_before_training(run, tmp_pa
 
 
 def test_a_full_disk_keeps_the_previous_checkpoint(run, tmp_path, monkeypatch):
-    write = checkpoint_module._write
+    write, write_text = checkpoint_module._write, Path.write_text
 
-    def full_after_the_first(data, file):
+    def refuse_if_full():
         if list(tmp_path.rglob("model_0.pt")):
-            file.write(b"half of i")
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def write_checkpoint(data, file):
+        file.write(b"half of i")
+        refuse_if_full()
+        file.seek(0)
         write(data, file)
 
-    monkeypatch.setattr(checkpoint_module, "_write", full_after_the_first)
+    def write_small_file(self, text):
+        refuse_if_full()
+        return write_text(self, text)
+
+    monkeypatch.setattr(checkpoint_module, "_write", write_checkpoint)
+    monkeypatch.setattr(Path, "write_text", write_small_file)
     outcome = run("train", TASK, *SMALL, "--log-root", str(tmp_path))
     assert outcome.status == 1
     assert "disk is full" in outcome.message

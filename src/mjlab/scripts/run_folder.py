@@ -18,8 +18,11 @@ def write_run_info(run_dir: Path, **info: Any) -> None:
     path = run_dir / _INFO_FILE
     text = json.dumps({**read_run_info(run_dir), **info}, indent=2)
     temporary = path.with_suffix(".tmp")
-    temporary.write_text(text + "\n")
-    temporary.replace(path)
+    try:
+        temporary.write_text(text + "\n")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def read_run_info(run_dir: Path) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import sys
 from dataclasses import asdict, dataclass, field
@@ -227,9 +228,12 @@ def _learn(task: str, cfg: TrainConfig, runner: MjlabOnPolicyRunner, run_dir: Pa
     try:
         runner.learn(cfg.agent.max_iterations, init_at_random_ep_len=True)
     finally:
-        write_run_info(
-            run_dir, ended=runner.stop_reason, iterations=runner.current_learning_iteration
-        )
+        # On a full disk, what the folder says about its end is not worth hiding the error that
+        # says which checkpoint is intact.
+        with contextlib.suppress(OSError):
+            write_run_info(
+                run_dir, ended=runner.stop_reason, iterations=runner.current_learning_iteration
+            )
 
 
 def _leave_results(task: str, cfg: TrainConfig, run_dir: Path, device: str) -> None:

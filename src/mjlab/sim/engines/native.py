@@ -102,6 +102,7 @@ class NativeEngine(Engine):
                 f"The native engine refuses this model: {error}. Use --engine warp."
             ) from error
         self._arrays: dict[str, np.ndarray] = {}
+        self._derived: set[str] = set()
         self._tensors: dict[str, torch.Tensor] = {}
         self._model_arrays: dict[str, np.ndarray] = {}
         self._model_tensors: dict[str, torch.Tensor] = {}
@@ -142,18 +143,23 @@ class NativeEngine(Engine):
         Only this field is made current. The others stay as they were, and so does the solver's
         warm start: whether a field is first read in the middle of a step changes nothing else.
         """
-        rows = self._batch.bind("state")
-        warm_start = rows[:, self._warm_start].copy()
-        derived = [n for n in self._arrays if n not in _INPUT_FIELDS and n != new]
-        saved = {name: self._arrays[name].copy() for name in derived}
-        self._batch.forward()
-        rows[:, self._warm_start] = warm_start
+        others = [name for name in self._derived if name != new]
+        saved = {name: self._arrays[name].copy() for name in others}
+        self._forward_keeping_warm_start()
         for name, values in saved.items():
             self._arrays[name][:] = values
+
+    def _forward_keeping_warm_start(self) -> None:
+        rows = self._batch.bind("state")
+        warm_start = rows[:, self._warm_start].copy()
+        self._batch.forward()
+        rows[:, self._warm_start] = warm_start
 
     def _bind(self, name: str) -> torch.Tensor:
         array = _as_float32(self._batch.bind, name, "MjData")
         self._arrays[name] = array
+        if name not in _INPUT_FIELDS:
+            self._derived.add(name)
         self._tensors[name] = _as_tensor(name, array)
         return self._tensors[name]
 
@@ -201,7 +207,10 @@ class NativeEngine(Engine):
         self._batch.step(nstep=nstep)
 
     def forward(self, env_ids: torch.Tensor | None) -> None:
-        self._batch.forward(_as_ids(env_ids))
+        # Where nobody reads a derived field there is nothing to make current. One that is read
+        # later is computed then.
+        if self._derived:
+            self._batch.forward(_as_ids(env_ids))
 
     def reset(self, env_ids: torch.Tensor | None) -> None:
         # Written through the bound copies and not with Batch.reset, which would keep writes that
@@ -299,8 +308,9 @@ class NativeEngine(Engine):
                 getattr(mj_data, name)[:] = value
 
     def state_dict(self) -> dict[str, Any]:
-        # A call consumes the writes that are still pending, so that the rows hold everything.
-        self._batch.forward()
+        # A call consumes the writes that are still pending, so that the rows hold everything; and
+        # saving must not change how the run goes on.
+        self._forward_keeping_warm_start()
         return {
             "state": torch.from_numpy(self._batch.bind("state").copy()),
             "bound": sorted(self._arrays),
