@@ -128,6 +128,8 @@ _DROPPED_FIELDS: dict[str, dict[str, tuple[str, _Translation | None]]] = {
         )
     },
 }
+# MuJoCo features that earlier releases had to enable and today's has on.
+ALWAYS_ENABLED_FLAGS = frozenset({"multiccd"})
 _LOOSE_DEFAULTS: dict[str, dict[str, Any]] = {"CollisionCfg": _REQUIRED_BEFORE_1_6}
 
 

@@ -384,3 +384,9 @@ def test_an_older_flag_is_accepted_with_a_warning():
     off = MujocoCfg(multiccd=False, disableflags=("contact",))  # ty: ignore
     assert off.disableflags == ("contact", "multiccd")
     off.apply(mujoco.MjModel.from_xml_string("<mujoco/>"))
+
+
+def test_a_feature_that_is_always_on_today_may_still_be_enabled():
+    model = mujoco.MjSpec.from_string(SLIDER_AND_BALL).compile()
+    MujocoCfg(enableflags=("multiccd",)).apply(model)
+    assert not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_MULTICCD

@@ -29,6 +29,7 @@ from mjlab.managers import (
     TerminationManager,
 )
 from mjlab.scene import Scene
+from mjlab.sim.engine import resolve_engine_name
 from mjlab.sim.simulation import Simulation
 from mjlab.utils import spaces
 from mjlab.utils.random import seed_rng
@@ -63,8 +64,11 @@ class ManagerBasedRlEnv:
 
         Raises:
             ValueError: whatever is wrong with the config, by name, before any stepping.
+            EngineUnavailableError: the engine cannot serve the device, or cannot run here.
         """
         check_env_cfg(cfg)
+        # Refused before tensors go to a device that the engine does not serve.
+        resolve_engine_name(cfg.sim.engine, device)
         self.cfg = cfg
         cfg.seed = self.seed(-1 if cfg.seed is None else cfg.seed)
         self.render_mode = render_mode

@@ -212,12 +212,16 @@ def _build_runner(
     task: str, cfg: TrainConfig, env: Any, run_dir: Path, device: str
 ) -> MjlabOnPolicyRunner:
     from mjlab.rl import MjlabOnPolicyRunner
+    from mjlab.utils.random import seed_rng
 
     runner_cls: Any = load_runner_cls(task) or MjlabOnPolicyRunner
     if cfg.agent.logger == "wandb":
         from mjlab.utils.wandb import add_wandb_tags
 
         add_wandb_tags(cfg.agent.wandb_tags)
+    # Seeded anew, so that the first networks depend on the seed alone and not on how many random
+    # numbers the environment drew while it was built.
+    seed_rng(cfg.agent.seed)
     return runner_cls(env, asdict(cfg.agent), str(run_dir), device)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from mjlab.compat import accepts_older_fields
+from mjlab.compat import ALWAYS_ENABLED_FLAGS, accepts_older_fields
 from mjlab.utils.nan_guard import NanGuardCfg
 
 if TYPE_CHECKING:
@@ -91,6 +91,8 @@ class MujocoCfg:
         enum_name = "mjtDisableBit" if kind == "disableflags" else "mjtEnableBit"
         bits = 0
         for flag in getattr(self, kind):
+            if kind == "enableflags" and flag in ALWAYS_ENABLED_FLAGS:
+                continue
             bits |= int(_enum_value(mujoco, kind, enum_name, _FLAG_PREFIXES[kind], flag))
         return bits
 
