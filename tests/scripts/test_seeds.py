@@ -31,7 +31,7 @@ def test_each_seed_trains_once_and_to_the_end(run, commands):
         assert command[:4] == [sys.executable, "-m", "mjlab.scripts.train", TASK]
         flags = dict(zip(command[4::2], command[5::2], strict=True))
         assert flags == {
-            "--agent.evaluation.stop-when-solved": "False",
+            "--agent.evaluation.solved-return": "None",
             "--num-envs": "64",
             "--agent.seed": str(seed),
             "--agent.run-name": f"seed_{seed}",

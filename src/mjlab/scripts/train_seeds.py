@@ -26,7 +26,7 @@ def _command(argv: list[str]) -> None:
         # Curves that are to be averaged have to be of one length, so no run stops early; flags
         # given by hand come last and win.
         command = [sys.executable, "-m", "mjlab.scripts.train", task]
-        command += ["--agent.evaluation.stop-when-solved", "False"]
+        command += ["--agent.evaluation.solved-return", "None"]
         command += [*flags, "--agent.seed", str(seed), "--agent.run-name", f"seed_{seed}"]
         status = subprocess.run(command, check=False).returncode
         if status != 0:
