@@ -25,6 +25,7 @@ from mjlab.actuator import (
     XmlActuatorCfg,
 )
 from mjlab.actuator.actuator import delay_command
+from mjlab.actuator.direct import DirectActuator
 from mjlab.utils.buffers import DelayBuffer
 from mjlab.utils.state import capture_state, restore_state
 
@@ -142,6 +143,18 @@ def test_custom_kind_that_adds_no_elements_is_refused(make_world):
 
     with pytest.raises(RuntimeError, match="must append what it adds to self._mjs_actuators"):
         make_world(ForgetfulCfg(target_names_expr=JOINTS))
+
+
+def test_custom_kind_that_does_not_say_what_to_add_is_refused(make_world):
+    class Silent(DirectActuator):
+        command_fields = ("effort",)
+
+    class SilentCfg(ActuatorCfg):
+        def build(self, entity: Any, target_ids: list[int], target_names: list[str]) -> Silent:
+            return Silent(self, entity, target_ids, target_names)
+
+    with pytest.raises(NotImplementedError, match=r"Silent must define _add_element.*or edit_spec"):
+        make_world(SilentCfg(target_names_expr=JOINTS))
 
 
 def test_custom_kind_acts_by_its_own_compute(make_world):

@@ -19,6 +19,7 @@ import pytest
 import torch
 
 from mjlab.envs import ManagerBasedRlEnv
+from mjlab.tasks import registry
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tutorial.md"
 NUM_ENVS = 4
@@ -63,9 +64,12 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     entries = project["entry-points"]["mjlab.tasks"]
     lines = [f"{name} = {value}" for name, value in entries.items()]
     (info / "entry_points.txt").write_text("\n".join(["[mjlab.tasks]", *lines, ""]))
-    sys.path.insert(0, str(folder))
-    yield package
-    sys.path.remove(str(folder))
+    # What is found once stays for all tests, what the package registers only for those here.
+    registry.list_tasks()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "_tasks", dict(registry._tasks))
+        patch.syspath_prepend(str(folder))
+        yield package
     for name in [name for name in sys.modules if name.split(".")[0] == "my_tasks"]:
         del sys.modules[name]
 

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import mujoco
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -40,15 +39,3 @@ def train(run) -> Callable[..., Path]:
 def trained(train, tmp_path_factory) -> Path:
     """Return the folder of a finished run of two iterations; not to be changed."""
     return train(tmp_path_factory.mktemp("trained") / "logs", 2)
-
-
-@pytest.fixture(scope="session")
-def gl() -> None:
-    """Skip where this machine cannot render offscreen."""
-    from mjlab.viewer.errors import RenderingUnavailableError
-    from mjlab.viewer.gl_context import open_renderer
-
-    try:
-        open_renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
-    except RenderingUnavailableError as error:
-        pytest.skip(str(error))

@@ -390,3 +390,28 @@ def test_a_feature_that_is_always_on_today_may_still_be_enabled():
     model = mujoco.MjSpec.from_string(SLIDER_AND_BALL).compile()
     MujocoCfg(enableflags=("multiccd",)).apply(model)
     assert not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_MULTICCD
+
+
+def test_the_warm_start_of_a_diverged_environment_does_not_come_back():
+    sim = make_sim()
+    sim.data.qvel[1] = float("nan")
+    sim.step()
+    sim.reset(torch.tensor([1]))
+    # Reading a field for the first time computes it, and must not bring the old values back.
+    assert torch.isfinite(sim.data.xpos).all()
+    sim.step(50)
+    assert torch.isfinite(sim.data.qpos).all()
+
+
+def test_saving_right_after_a_reset_does_not_change_the_run():
+    runs = []
+    for saves in (False, True):
+        sim = make_sim()
+        sim.step(120)
+        sim.reset(torch.tensor([1]))
+        sim.data.qpos[1, 3] = 0.09
+        if saves:
+            sim.state_dict()
+        sim.step(30)
+        runs.append(sim.data.qpos.clone())
+    assert torch.equal(*runs)

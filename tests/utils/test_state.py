@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import enum
 import io
+from collections import defaultdict, deque
 
+import numpy as np
 import torch
 
-from mjlab.utils.state import capture_state, restore_state, stateful
+from mjlab.utils.state import capture_state, restore_state, shape_differences, stateful
 
 
 @stateful
@@ -86,8 +89,69 @@ def test_an_object_reached_twice_is_saved_once():
     assert "alias" not in capture_state(Owner())
 
 
-def test_state_of_an_attribute_that_is_gone_is_reported(caplog):
+def test_an_attribute_made_at_the_first_call_is_made():
     saved = capture_state(Buffer())
-    saved["old_name"] = 3
-    restore_state(Buffer(), saved)
-    assert "Buffer.old_name" in caplog.text
+    saved["made_later"] = torch.ones(2)
+    fresh = Buffer()
+    restore_state(fresh, saved)
+    assert torch.equal(fresh.made_later, torch.ones(2))  # ty: ignore
+
+
+def test_an_object_that_does_not_exist_yet_is_reported_and_left(caplog):
+    owner = Owner()
+    owner.nothing = Buffer()  # ty: ignore
+    fresh = Owner()
+    restore_state(fresh, capture_state(owner))
+    assert fresh.nothing is None
+    assert "Owner.nothing is not restored: it was a Buffer" in caplog.text
+
+
+@stateful
+class Assorted:
+    def __init__(self) -> None:
+        self.numpy_number: float = 0.0
+        self.array = np.zeros(3, dtype=np.float32)
+        self.recent = deque([1, 2], maxlen=3)
+        self.counts = defaultdict(int, a=1)
+        self.generator = torch.Generator()
+        self.shared = torch.ones(3).expand(4, 3)
+        self.color = Color.RED
+        self.device = "cpu"
+
+
+class Color(enum.StrEnum):
+    RED = "red"
+
+
+def test_values_of_other_libraries_become_plain_and_come_back():
+    one = Assorted()
+    one.numpy_number = np.float64(2.5)
+    one.array[:] = 4
+    one.recent.append(9)
+    one.counts["b"] = 7
+    torch.rand(5, generator=one.generator)
+    saved = capture_state(one)
+    assert type(saved["numpy_number"]) is float
+    assert not {"shared", "color", "device"} & saved.keys()
+    stream = io.BytesIO()
+    torch.save(saved, stream)
+    stream.seek(0)
+    two = Assorted()
+    restore_state(two, torch.load(stream, weights_only=True))
+    assert two.numpy_number == 2.5
+    np.testing.assert_array_equal(two.array, one.array)
+    assert two.recent == deque([1, 2, 9], maxlen=3)
+    assert two.recent.maxlen == 3
+    assert dict(two.counts) == {"a": 1, "b": 7}
+    assert torch.equal(
+        torch.rand(2, generator=one.generator), torch.rand(2, generator=two.generator)
+    )
+
+
+def test_shapes_that_differ_are_named():
+    saved, current = capture_state(Owner()), capture_state(Owner())
+    saved["buffers"]["a"]["values"] = torch.zeros(7)
+    assert shape_differences(saved, current) == [
+        "buffers.a.values has shape (7,) there and (4,) here"
+    ]
+    assert shape_differences(current, current) == []

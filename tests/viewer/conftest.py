@@ -7,22 +7,9 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import mujoco
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
-
-
-@pytest.fixture(scope="session")
-def gl() -> None:
-    """Skip where this machine cannot render offscreen."""
-    from mjlab.viewer.errors import RenderingUnavailableError
-    from mjlab.viewer.gl_context import open_renderer
-
-    try:
-        open_renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
-    except RenderingUnavailableError as error:
-        pytest.skip(str(error))
 
 
 @pytest.fixture

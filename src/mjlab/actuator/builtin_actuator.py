@@ -63,22 +63,15 @@ class BuiltinPositionActuator(DirectActuator[BuiltinPositionActuatorCfg]):
         """The position target."""
         return ("position",)
 
-    def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
-        """Add one servo for each target."""
-        cfg = self.cfg
-        for name in target_names:
-            element = create_position_actuator(
-                spec,
-                name,
-                stiffness=cfg.stiffness,
-                damping=cfg.damping,
-                effort_limit=cfg.effort_limit,
-                armature=cfg.armature,
-                frictionloss=cfg.frictionloss,
-                viscous_damping=cfg.viscous_damping,
-                transmission_type=self.transmission_type,
-            )
-            self._mjs_actuators.append(element)
+    def _add_element(self, spec: mujoco.MjSpec, target_name: str) -> mujoco.MjsActuator:
+        return create_position_actuator(
+            spec,
+            target_name,
+            stiffness=self.cfg.stiffness,
+            damping=self.cfg.damping,
+            effort_limit=self.cfg.effort_limit,
+            transmission_type=self.transmission_type,
+        )
 
 
 @dataclass(kw_only=True)
@@ -110,21 +103,14 @@ class BuiltinVelocityActuator(DirectActuator[BuiltinVelocityActuatorCfg]):
         """The velocity target."""
         return ("velocity",)
 
-    def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
-        """Add one servo for each target."""
-        cfg = self.cfg
-        for name in target_names:
-            element = create_velocity_actuator(
-                spec,
-                name,
-                damping=cfg.damping,
-                effort_limit=cfg.effort_limit,
-                armature=cfg.armature,
-                frictionloss=cfg.frictionloss,
-                viscous_damping=cfg.viscous_damping,
-                transmission_type=self.transmission_type,
-            )
-            self._mjs_actuators.append(element)
+    def _add_element(self, spec: mujoco.MjSpec, target_name: str) -> mujoco.MjsActuator:
+        return create_velocity_actuator(
+            spec,
+            target_name,
+            damping=self.cfg.damping,
+            effort_limit=self.cfg.effort_limit,
+            transmission_type=self.transmission_type,
+        )
 
 
 @dataclass(kw_only=True)
@@ -158,18 +144,11 @@ class BuiltinMotorActuator(DirectActuator[BuiltinMotorActuatorCfg]):
         """The effort target."""
         return ("effort",)
 
-    def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
-        """Add one motor for each target."""
-        cfg = self.cfg
-        for name in target_names:
-            element = create_motor_actuator(
-                spec,
-                name,
-                effort_limit=cfg.effort_limit,
-                gear=cfg.gear,
-                armature=cfg.armature,
-                frictionloss=cfg.frictionloss,
-                viscous_damping=cfg.viscous_damping,
-                transmission_type=self.transmission_type,
-            )
-            self._mjs_actuators.append(element)
+    def _add_element(self, spec: mujoco.MjSpec, target_name: str) -> mujoco.MjsActuator:
+        return create_motor_actuator(
+            spec,
+            target_name,
+            effort_limit=self.cfg.effort_limit,
+            gear=self.cfg.gear,
+            transmission_type=self.transmission_type,
+        )

@@ -139,16 +139,12 @@ class BuiltinDcMotorActuator(DirectActuator[BuiltinDcMotorActuatorCfg]):
         """What the mode reads; a voltage is given as effort target."""
         return (_COMMAND_OF_MODE[DcMotorInputMode(self.cfg.mode)],)
 
-    def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
-        """Add one DC motor for each target."""
-        for name in target_names:
-            element = spec.add_actuator(
-                name=name, target=name, trntype=_TRANSMISSIONS[self.transmission_type.value]
-            )
-            self._set_dc_motor(element)
-            element.gear[0] = self.cfg.gear
-            self._mjs_actuators.append(element)
-            self._override_target(spec, name)
+    def _add_element(self, spec: mujoco.MjSpec, target_name: str) -> mujoco.MjsActuator:
+        trntype = _TRANSMISSIONS[self.transmission_type.value]
+        element = spec.add_actuator(name=target_name, target=target_name, trntype=trntype)
+        self._set_dc_motor(element)
+        element.gear[0] = self.cfg.gear
+        return element
 
     def _set_dc_motor(self, element: mujoco.MjsActuator) -> None:
         cfg, motor = self.cfg, self.cfg.motor_params

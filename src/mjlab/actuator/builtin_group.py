@@ -14,6 +14,7 @@ from mjlab.actuator._columns import (
     write_columns,
 )
 from mjlab.actuator._delay import delay_rows
+from mjlab.actuator._grouping import acts_like, delay_settings, share_line
 from mjlab.actuator.actuator import Actuator
 from mjlab.actuator.command import target_field
 from mjlab.actuator.direct import DirectActuator
@@ -21,9 +22,6 @@ from mjlab.utils.buffers import DelayBuffer
 
 if TYPE_CHECKING:
     from mjlab.entity import EntityData
-
-# What a subclass must not have changed, for its actuators to be written by a group.
-_METHODS = ("compute", "compute_after_reset", "get_command", "apply_delay", "apply_controls")
 
 
 @dataclass
@@ -99,37 +97,13 @@ class BuiltinActuatorGroup:
                 write_columns(ctrl, route.ctrl, command, env_ids)
 
 
-def delay_settings(actuator: Actuator) -> tuple[Any, ...]:
-    """Return what has to agree for actuators to share a delay line."""
-    cfg = actuator.cfg
-    return (
-        type(actuator),
-        actuator.transmission_type,
-        cfg.delay_min_lag,
-        cfg.delay_max_lag,
-        cfg.delay_hold_prob,
-        cfg.delay_update_period,
-        cfg.delay_per_env_phase,
-    )
-
-
-def share_line(members: Sequence[Actuator], num_envs: int, device: str) -> DelayBuffer:
-    """Make one delay line for actuators with equal settings, and have the first one reset it."""
-    line = members[0].make_delay_buffer(num_envs, device)
-    for k, actuator in enumerate(members):
-        actuator.join_group(line, resets_delay=k == 0)
-    return line
-
-
 def _passes_commands(actuator: Actuator) -> TypeGuard[DirectActuator]:
-    if not isinstance(actuator, DirectActuator):
-        return False
-    unchanged = all(
-        getattr(type(actuator), name) is getattr(DirectActuator, name) for name in _METHODS
-    )
     # A site has no position or velocity target; where one is asked for, `compute` gives zeros.
-    targets = [target_field(actuator.transmission_type, name) for name in actuator.command_fields]
-    return unchanged and None not in targets
+    return (
+        isinstance(actuator, DirectActuator)
+        and acts_like(actuator, DirectActuator)
+        and all(target_field(actuator.transmission_type, name) for name in actuator.command_fields)
+    )
 
 
 def _by_line(actuators: Sequence[DirectActuator]) -> dict[Any, list[DirectActuator]]:

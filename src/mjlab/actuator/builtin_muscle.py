@@ -64,26 +64,22 @@ class BuiltinMuscleActuator(DirectActuator[BuiltinMuscleActuatorCfg]):
         """The effort target, as excitation."""
         return ("effort",)
 
-    def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
-        """Add one muscle for each target."""
+    def _add_element(self, spec: mujoco.MjSpec, target_name: str) -> mujoco.MjsActuator:
         cfg = self.cfg
-        for name in target_names:
-            element = create_muscle_actuator(
-                spec,
-                name,
-                length_range=cfg.length_range,
-                gear=cfg.gear,
-                timeconst=cfg.timeconst,
-                tausmooth=cfg.tausmooth,
-                range=cfg.range,
-                force=cfg.force,
-                scale=cfg.scale,
-                lmin=cfg.lmin,
-                lmax=cfg.lmax,
-                vmax=cfg.vmax,
-                fpmax=cfg.fpmax,
-                fvmax=cfg.fvmax,
-                transmission_type=self.transmission_type,
-            )
-            self._mjs_actuators.append(element)
-            self._override_target(spec, name)
+        return create_muscle_actuator(
+            spec,
+            target_name,
+            length_range=cfg.length_range,
+            gear=cfg.gear,
+            timeconst=cfg.timeconst,
+            tausmooth=cfg.tausmooth,
+            range=cfg.range,
+            force=cfg.force,
+            scale=cfg.scale,
+            lmin=cfg.lmin,
+            lmax=cfg.lmax,
+            vmax=cfg.vmax,
+            fpmax=cfg.fpmax,
+            fvmax=cfg.fvmax,
+            transmission_type=self.transmission_type,
+        )

@@ -74,6 +74,7 @@ class BuiltinPdActuator(DirectActuator[BuiltinPdActuatorCfg]):
         """Add `<target>_pd_pos` for each target, then `<target>_pd_vel` for each."""
         for name in target_names:
             self._position_elements.append(self._add_position_servo(spec, name))
+            self._override_target(spec, name)
         for name in target_names:
             element = create_velocity_actuator(
                 spec,
@@ -92,9 +93,6 @@ class BuiltinPdActuator(DirectActuator[BuiltinPdActuatorCfg]):
             name,
             stiffness=self.cfg.stiffness,
             damping=0.0,
-            armature=self.cfg.armature,
-            frictionloss=self.cfg.frictionloss,
-            viscous_damping=self.cfg.viscous_damping,
             transmission_type=self.transmission_type,
             actuator_name=f"{name}_pd_pos",
         )

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 class DirectActuator(Actuator[ActuatorCfgT]):
     """An actuator whose controls are the commands in `command_fields`, one block of columns each.
 
-    Many of them are written to the simulation at once, by `BuiltinActuatorGroup`.
+    Many of them are written to the simulation at once, by `BuiltinActuatorGroup`. A subclass
+    defines `command_fields`, and what it adds to the spec: `_add_element`, or all of `edit_spec`.
     """
 
     shares_delay: ClassVar[bool] = False
@@ -29,6 +30,18 @@ class DirectActuator(Actuator[ActuatorCfgT]):
     def command_fields(self) -> tuple[CommandField, ...]:
         """Which commands the elements read."""
         raise NotImplementedError(f"{type(self).__name__} must define command_fields.")
+
+    def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
+        """Add one element for each target, and write the config's properties to the target."""
+        for name in target_names:
+            self._mjs_actuators.append(self._add_element(spec, name))
+            self._override_target(spec, name)
+
+    def _add_element(self, spec: mujoco.MjSpec, target_name: str) -> mujoco.MjsActuator:
+        """Add the element of one target to `spec` and return it."""
+        raise NotImplementedError(
+            f"{type(self).__name__} must define _add_element(spec, target_name), or edit_spec."
+        )
 
     @constant_within_step
     def compute(self, cmd: ActuatorCmd) -> torch.Tensor:

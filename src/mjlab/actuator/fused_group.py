@@ -15,17 +15,14 @@ from mjlab.actuator._columns import (
     write_columns,
 )
 from mjlab.actuator._delay import delay_rows
+from mjlab.actuator._grouping import acts_like, delay_settings, share_line
 from mjlab.actuator.actuator import Actuator, ActuatorCmd, TransmissionType
-from mjlab.actuator.builtin_group import delay_settings, share_line
 from mjlab.actuator.command import read_command
 from mjlab.actuator.pd_actuator import IdealPdActuator
 from mjlab.utils.buffers import DelayBuffer
 
 if TYPE_CHECKING:
     from mjlab.entity import EntityData
-
-# What a subclass must not have changed, for its actuators to be evaluated by a group.
-_METHODS = ("compute", "compute_after_reset", "get_command", "apply_delay", "apply_controls")
 
 
 @dataclass
@@ -111,9 +108,7 @@ class FusedActuatorGroup:
 def _is_fusable(actuator: Actuator) -> TypeGuard[IdealPdActuator]:
     return (
         isinstance(actuator, IdealPdActuator)
-        and all(
-            getattr(type(actuator), name) is getattr(IdealPdActuator, name) for name in _METHODS
-        )
+        and acts_like(actuator, IdealPdActuator)
         and actuator.transmission_type != TransmissionType.SITE
     )
 

@@ -99,11 +99,7 @@ class StateWriter:
         Raises:
             ValueError: the entity has a fixed base, or the width is wrong.
         """
-        self._require_floating("write_root_velocity")
-        check_width(velocity, 6, "The root velocity")
-        linear, angular = velocity[..., :3], velocity[..., 3:]
-        quat = self._root_quat(env_ids)
-        linear, angular = linear.expand(len(quat), 3), angular.expand(len(quat), 3)
+        quat, linear, angular = self._read_velocity("write_root_velocity", velocity, env_ids)
         angular_b = quat_apply_inverse(quat, angular)
         assign(self.data.qvel, torch.cat((linear, angular_b), dim=-1), env_ids, self._free_v)
 
@@ -113,11 +109,9 @@ class StateWriter:
         Raises:
             ValueError: the entity has a fixed base, or the width is wrong.
         """
-        self._require_floating("write_root_velocity_b")
-        check_width(velocity_b, 6, "The root velocity")
-        linear_b, angular_b = velocity_b[..., :3], velocity_b[..., 3:]
-        quat = self._root_quat(env_ids)
-        linear_b, angular_b = linear_b.expand(len(quat), 3), angular_b.expand(len(quat), 3)
+        quat, linear_b, angular_b = self._read_velocity(
+            "write_root_velocity_b", velocity_b, env_ids
+        )
         linear = quat_apply(quat, linear_b)
         assign(self.data.qvel, torch.cat((linear, angular_b), dim=-1), env_ids, self._free_v)
 
@@ -129,13 +123,9 @@ class StateWriter:
         Raises:
             ValueError: the entity has a fixed base, or the width is wrong.
         """
-        self._require_floating("write_root_com_velocity")
-        check_width(velocity, 6, "The root velocity")
-        linear, angular = velocity[..., :3], velocity[..., 3:]
+        quat, linear, angular = self._read_velocity("write_root_com_velocity", velocity, env_ids)
         offset_b = rows(self.model.body_ipos[:, self.indexing.root_body_id], env_ids)
-        offset = quat_apply(self._root_quat(env_ids), offset_b)
-        angular = angular.expand_as(offset)
-        linear = linear - torch.linalg.cross(angular, offset)
+        linear = linear - torch.linalg.cross(angular, quat_apply(quat, offset_b))
         self.write_root_velocity(torch.cat((linear, angular), dim=-1), env_ids)
 
     def write_joint_state(
@@ -225,9 +215,18 @@ class StateWriter:
         assign(self.data.mocap_pos, pose[..., :3], env_ids, mocap_id)
         assign(self.data.mocap_quat, pose[..., 3:], env_ids, mocap_id)
 
-    def _root_quat(self, env_ids: EnvIds) -> torch.Tensor:
-        """Return the root orientations (k, 4) that `qpos` holds now."""
-        return rows(self.data.qpos[:, self._free_q], env_ids)[:, 3:7]
+    def _read_velocity(
+        self, what: str, velocity: torch.Tensor, env_ids: EnvIds
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the orientations of the root now, (k, 4), and both halves of `velocity`, (k, 3).
+
+        Raises `ValueError`, naming the writer `what`, for a fixed base or a wrong width.
+        """
+        self._require_floating(what)
+        check_width(velocity, 6, "The root velocity")
+        quat = rows(self.data.qpos[:, self._free_q], env_ids)[:, 3:7]
+        halves = velocity.expand(len(quat), 6)
+        return quat, halves[:, :3], halves[:, 3:]
 
     def _require_floating(self, what: str) -> None:
         if self.is_fixed_base:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mjlab.utils.lazy import lazy_names
 
 if TYPE_CHECKING:
     from mjlab.envs.env_cfg import ManagerBasedRlEnvCfg as ManagerBasedRlEnvCfg
@@ -13,11 +15,5 @@ _LAZY = {
     "ManagerBasedRlEnvCfg": "mjlab.envs.env_cfg",
 }
 
-
-def __getattr__(name: str) -> Any:
-    # A config needs the config class alone; the environment loads when one is built.
-    if name in _LAZY:
-        import importlib
-
-        return getattr(importlib.import_module(_LAZY[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+# A config needs the config class alone; the environment loads when one is built.
+__getattr__ = lazy_names(__name__, _LAZY)

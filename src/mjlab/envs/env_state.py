@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.utils.state import capture_state, restore_state
+from mjlab.utils.state import capture_state, restore_state, shape_differences
 
 if TYPE_CHECKING:
     from mjlab.envs.manager_based_rl_env import ManagerBasedRlEnv
@@ -29,6 +29,7 @@ def state_dict(env: ManagerBasedRlEnv) -> dict[str, Any]:
     """Return counters, buffers, physics, scene and managers of `env`."""
     return {
         "num_envs": env.num_envs,
+        "terms": _terms(env),
         "counters": {name: getattr(env, name) for name in _COUNTERS},
         "buffers": {name: getattr(env, name).clone() for name in _BUFFERS},
         "observations": _cloned(env.obs_buf),
@@ -44,25 +45,57 @@ def load_state_dict(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
     """Write `state` back into `env`, which was built from the same config.
 
     Raises:
-        ValueError: the state is of another number of environments.
+        ValueError: the state is of another task, size or engine; nothing was changed then.
     """
+    _check_fits(env, state)
+    for name, value in state["counters"].items():
+        setattr(env, name, value)
+    for name, value in state["buffers"].items():
+        getattr(env, name).copy_(value)
+    for name in _managers(env):
+        restore_state(getattr(env, name), state["managers"][name])
+        getattr(env, name).apply_config_edits(state["config_edits"][name])
+    restore_state(env.scene, state["scene"])
+    # Physics comes last, so that entity buffers which view simulation fields end up as saved.
+    env.sim.load_state_dict(state["sim"])
+    env.obs_buf = _cloned(state["observations"])
+
+
+def _check_fits(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
     if state["num_envs"] != env.num_envs:
         raise ValueError(
             f"The saved environment state is of {state['num_envs']} environments; this run has "
             f"{env.num_envs}. Resume with --num-envs {state['num_envs']} to continue exactly."
         )
-    for name, value in state["counters"].items():
-        setattr(env, name, value)
-    for name, value in state["buffers"].items():
-        getattr(env, name).copy_(value)
-    for name, value in state["managers"].items():
-        restore_state(getattr(env, name), value)
-    for name, value in state["config_edits"].items():
-        getattr(env, name).apply_config_edits(value)
-    restore_state(env.scene, state["scene"])
-    # Physics comes last, so that entity buffers which view simulation fields end up as saved.
-    env.sim.load_state_dict(state["sim"])
-    env.obs_buf = _cloned(state["observations"])
+    if state["sim"]["engine"] != env.sim.engine_name:
+        raise ValueError(
+            f"The saved environment state is of the {state['sim']['engine']} engine; this run has "
+            f"{env.sim.engine_name}. Resume with --engine {state['sim']['engine']}."
+        )
+    current = state_dict(env)
+    differences = [
+        f"{manager} had the terms {state['terms'].get(manager)} and has {current['terms'].get(manager)}"
+        for manager in sorted(state["terms"].keys() | current["terms"].keys())
+        if state["terms"].get(manager) != current["terms"].get(manager)
+    ]
+    differences += shape_differences(state, current)
+    if differences:
+        more = f"; and {len(differences) - 5} more" if len(differences) > 5 else ""
+        raise ValueError(
+            "The task is not the one that was saved: " + "; ".join(differences[:5]) + more + "."
+        )
+
+
+def _terms(env: ManagerBasedRlEnv) -> dict[str, Any]:
+    """Return the names of the terms that each manager has, in order."""
+    terms = {}
+    for name in _managers(env):
+        active = getattr(env, name).active_terms
+        if isinstance(active, dict):
+            terms[name] = {str(key): list(names) for key, names in active.items()}
+        else:
+            terms[name] = list(active)
+    return terms
 
 
 def _managers(env: ManagerBasedRlEnv) -> list[str]:

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.managers.built_terms import BuiltTermsManager
 from mjlab.managers.env_ids import as_index
 from mjlab.managers.finite_action import finite_action_check
-from mjlab.managers.manager_base import ManagerBase, ManagerTermBase
+from mjlab.managers.manager_base import ManagerTermBase
 from mjlab.utils.substep import is_constant_within_step
 
 if TYPE_CHECKING:
@@ -71,29 +72,24 @@ class ActionTerm(ManagerTermBase):
         raise NotImplementedError(f"{self.name} must define apply_actions.")
 
 
-class ActionManager(ManagerBase):
+class ActionManager(BuiltTermsManager[ActionTerm]):
     """Splits the action among its terms and remembers the last three actions.
 
     The config is kept by reference.
     """
 
     _transient = {"_action", "_prev_action", "_prev_prev_action", "_action_parts"}
+    _cfg_type = ActionTermCfg
+    _term_type = ActionTerm
 
     def __init__(self, cfg: Mapping[str, ActionTermCfg | None], env: ManagerBasedRlEnv) -> None:
-        self.cfg = cfg
-        self._terms: dict[str, ActionTerm] = {}
-        super().__init__(env)
+        super().__init__(cfg, env)
         size = (3, self.num_envs, self.total_action_dim)
         # Newest first, in one tensor, so that a reset clears all three at once.
         self._history = torch.zeros(size, device=self.device)
         self._action, self._prev_action, self._prev_prev_action = self._history
         self._action_parts = self._action.split(self.action_term_dim, dim=1)
         self._check_finite = finite_action_check(self.num_envs, self.total_action_dim, self.device)
-
-    @property
-    def active_terms(self) -> list[str]:
-        """Names of the terms, in the order of their parts of the action."""
-        return self._term_names
 
     @property
     def action_term_dim(self) -> list[int]:
@@ -139,7 +135,7 @@ class ActionManager(ManagerBase):
             raise ValueError(
                 f"The action has shape {tuple(action.shape)}, expected {tuple(self._action.shape)} "
                 f"(environments, components); components by term: "
-                f"{dict(zip(self._term_names, self.action_term_dim, strict=True))}."
+                f"{dict(zip(self._terms, self.action_term_dim, strict=True))}."
             )
         self._check_finite(action)
         self._prev_prev_action.copy_(self._prev_action)
@@ -161,29 +157,9 @@ class ActionManager(ManagerBase):
             term.reset(env_ids=index)
         return {}
 
-    def get_term(self, name: str) -> ActionTerm:
-        """Return a term; raises `KeyError`, with the valid names, if there is none."""
-        if name not in self._terms:
-            self._unknown(name, self._term_names, KeyError)
-        return self._terms[name]
-
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
         """Return, for one environment, the raw action of each term."""
         return [(name, term.raw_action[env_idx].tolist()) for name, term in self._terms.items()]
-
-    def _prepare_terms(self) -> None:
-        for name, term_cfg in self._enabled(self.cfg, ActionTermCfg):
-            term = term_cfg.build(self._env)
-            if not isinstance(term, ActionTerm):
-                raise TypeError(
-                    f"{self._label(name)}: {type(term_cfg).__name__}.build must return an "
-                    f"ActionTerm, got {type(term).__name__}."
-                )
-            self._terms[name] = term
-        self._term_names = list(self._terms)
-
-    def _live_cfgs(self) -> dict[str, Any]:
-        return {name: term.cfg for name, term in self._terms.items()}
 
     def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
         rows = [(name, term.action_dim) for name, term in self._terms.items()]

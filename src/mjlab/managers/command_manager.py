@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.managers.built_terms import BuiltTermsManager
 from mjlab.managers.debug_vis import DebugVisSwitches
 from mjlab.managers.env_ids import as_ids, is_empty
-from mjlab.managers.manager_base import ManagerBase, ManagerTermBase
+from mjlab.managers.manager_base import ManagerTermBase
 from mjlab.managers.null_managers import NullCommandManager as NullCommandManager
 
 if TYPE_CHECKING:
@@ -179,18 +180,14 @@ class CommandTerm(ManagerTermBase):
             )
 
 
-class CommandManager(DebugVisSwitches, ManagerBase):
+class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
     """Holds the commands by name. The config is kept by reference and may be edited."""
 
-    def __init__(self, cfg: Mapping[str, CommandTermCfg | None], env: ManagerBasedRlEnv) -> None:
-        self.cfg = cfg
-        self._terms: dict[str, CommandTerm] = {}
-        super().__init__(env)
+    _cfg_type = CommandTermCfg
+    _term_type = CommandTerm
 
-    @property
-    def active_terms(self) -> list[str]:
-        """Names of the commands."""
-        return list(self._terms)
+    def __init__(self, cfg: Mapping[str, CommandTermCfg | None], env: ManagerBasedRlEnv) -> None:
+        super().__init__(cfg, env)
 
     def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
         """Advance all commands by `dt` seconds; see `CommandTerm.compute`."""
@@ -208,12 +205,6 @@ class CommandManager(DebugVisSwitches, ManagerBase):
     def get_command(self, name: str) -> torch.Tensor:
         """Return the current command; raises `KeyError`, with the valid names, if unknown."""
         return self.get_term(name).command
-
-    def get_term(self, name: str) -> CommandTerm:
-        """Return a command's term; raises `KeyError`, with the valid names, if unknown."""
-        if name not in self._terms:
-            self._unknown(name, self.active_terms, KeyError)
-        return self._terms[name]
 
     def get_term_cfg(self, name: str) -> CommandTermCfg:
         """Return the live config of a command; raises `ValueError` if unknown."""
@@ -251,19 +242,6 @@ class CommandManager(DebugVisSwitches, ManagerBase):
         """Ask all commands for a state to write after a reset; return whether one wrote it."""
         wrote = [term.apply_gui_reset(env_ids) for term in self._terms.values()]
         return any(wrote)
-
-    def _prepare_terms(self) -> None:
-        for name, term_cfg in self._enabled(self.cfg, CommandTermCfg):
-            term = term_cfg.build(self._env)
-            if not isinstance(term, CommandTerm):
-                raise TypeError(
-                    f"{self._label(name)}: {type(term_cfg).__name__}.build must return a "
-                    f"CommandTerm, got {type(term).__name__}."
-                )
-            self._terms[name] = term
-
-    def _live_cfgs(self) -> dict[str, Any]:
-        return {name: term.cfg for name, term in self._terms.items()}
 
     def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
         rows = [(name, type(term).__name__) for name, term in self._terms.items()]

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-_PLAIN = (bool, int, float, str, type(None))
+from mjlab.utils.state import SKIP, plain_scalar
 
 
 def plain_values(cfg: Any) -> dict[str, Any]:
@@ -26,8 +26,10 @@ def plain_values(cfg: Any) -> dict[str, Any]:
             continue
         if _is_branch(value):
             values[key] = plain_values(value)
-        elif _is_plain(value):
-            values[key] = value.clone() if isinstance(value, torch.Tensor) else value
+        else:
+            plain = _plain(value)
+            if plain is not SKIP:
+                values[key] = plain
     return values
 
 
@@ -68,10 +70,16 @@ def _is_branch(value: Any) -> bool:
     return isinstance(value, dict) or is_instance
 
 
-def _is_plain(value: Any) -> bool:
-    if type(value) in (list, tuple):
-        return all(_is_plain(item) for item in value)
-    return isinstance(value, (*_PLAIN, torch.Tensor))
+def _plain(value: Any) -> Any:
+    """Return a copy of a plain value, of exactly the built-in types, or SKIP."""
+    if isinstance(value, torch.Tensor):
+        return value.clone()
+    if isinstance(value, (list, tuple)):
+        items = [_plain(item) for item in value]
+        if any(item is SKIP for item in items):
+            return SKIP
+        return items if isinstance(value, list) else tuple(items)
+    return plain_scalar(value)
 
 
 def _same(a: Any, b: Any) -> bool:

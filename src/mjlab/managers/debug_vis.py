@@ -53,3 +53,19 @@ class DebugVisSwitches:
             self.set_debug_vis(name, box.value)
             if on_change is not None:
                 on_change()
+
+
+class TermFunctionSwitches(DebugVisSwitches):
+    """The same for managers of a list of terms, where the function of a term is what may draw."""
+
+    _term_names: list[str]
+    _term_cfgs: list[Any]
+
+    def get_visualizable_terms(self) -> list[tuple[str, Any]]:
+        """Return the terms that can draw, as (name, function object)."""
+        terms = zip(self._term_names, self._term_cfgs, strict=True)
+        return [
+            (name, cfg.func)
+            for name, cfg in terms
+            if callable(getattr(cfg.func, "debug_vis", None))
+        ]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import torch
 
 from mjlab.compat import accepts_older_fields
-from mjlab.managers.debug_vis import DebugVisSwitches
+from mjlab.managers.debug_vis import TermFunctionSwitches
 from mjlab.managers.env_ids import as_ids, is_empty
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
 from mjlab.managers.model_fields import RecomputeLevel as RecomputeLevel
@@ -50,7 +50,7 @@ class EventTermCfg(ManagerTermBaseCfg):
     environment; 0 means at every reset."""
 
 
-class EventManager(DebugVisSwitches, TermListManager):
+class EventManager(TermFunctionSwitches, TermListManager):
     """Calls events at their time, and recomputes constants of the model that they changed.
 
     Raises `ValueError` for an unknown mode, and for mode "interval" without a valid
@@ -135,15 +135,6 @@ class EventManager(DebugVisSwitches, TermListManager):
                 if isinstance(timer, torch.Tensor):
                     timer[ids] = self._draw(cfg, len(ids))
         return {}
-
-    def get_visualizable_terms(self) -> list[tuple[str, Any]]:
-        """Return the events that can draw, as (name, function object)."""
-        terms = zip(self._term_names, self._term_cfgs, strict=True)
-        return [
-            (name, cfg.func)
-            for name, cfg in terms
-            if callable(getattr(cfg.func, "debug_vis", None))
-        ]
 
     def _apply_interval(self, name: str, cfg: EventTermCfg, dt: float) -> bool:
         timer = self._timers[name]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.managers.debug_vis import DebugVisSwitches
+from mjlab.managers.debug_vis import TermFunctionSwitches
 from mjlab.managers.env_ids import as_index, is_empty
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
 
@@ -24,7 +24,7 @@ class RewardTermCfg(ManagerTermBaseCfg):
     """Factor of the term in the sum. With 0 the function is not called at all."""
 
 
-class RewardManager(DebugVisSwitches, TermListManager):
+class RewardManager(TermFunctionSwitches, TermListManager):
     """Sums the weighted terms of a step, and of each episode.
 
     Args:
@@ -102,15 +102,6 @@ class RewardManager(DebugVisSwitches, TermListManager):
         """Return, for one environment, the weighted rate of each term in the last step."""
         rates = self._step_reward[env_idx].tolist()
         return [(name, [rate]) for name, rate in zip(self._term_names, rates, strict=True)]
-
-    def get_visualizable_terms(self) -> list[tuple[str, Any]]:
-        """Return the terms that can draw, as (name, function object)."""
-        terms = zip(self._term_names, self._term_cfgs, strict=True)
-        return [
-            (name, cfg.func)
-            for name, cfg in terms
-            if callable(getattr(cfg.func, "debug_vis", None))
-        ]
 
     def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
         terms = zip(self._term_names, self._term_cfgs, strict=True)

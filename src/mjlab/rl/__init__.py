@@ -6,8 +6,9 @@ command lines read, comes without torch.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mjlab.utils.lazy import lazy_names
 
 if TYPE_CHECKING:
     from mjlab.rl.config import EvaluationCfg as EvaluationCfg
@@ -29,8 +30,4 @@ _HOMES = {
 }
 __all__ = sorted(_HOMES)
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOMES[name]), name)
+__getattr__ = lazy_names(__name__, _HOMES)

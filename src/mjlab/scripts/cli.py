@@ -30,6 +30,8 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
     An error that a user can mend is printed as one message, and the exit status is 1. Anything
     else is a defect of the program and keeps its traceback.
     """
+    # torch's idle threads would otherwise spin, and take the cores from the physics threads.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     # Scripts report to people: plain messages of the libraries, and warnings as one line each.
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
     logging.getLogger("mjlab").setLevel(logging.INFO)
@@ -197,8 +199,3 @@ def task_usage(name: str, purpose: str, examples: list[str]) -> str:
         f"`{name} TASK --help` lists every flag of the task; `list-envs` lists the tasks.",
     ]
     return "\n".join(lines)
-
-
-def chosen(value: Any, default: Any) -> Any:
-    """Return `value`, or `default` where nothing was given."""
-    return default if value is None else value

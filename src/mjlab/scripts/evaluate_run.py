@@ -4,39 +4,25 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from mjlab.scripts.cli import UserError, resolve_device
-from mjlab.scripts.policy import constant_policy, find_checkpoint, load_policy, make_env
+from mjlab.scripts.policy import PolicyFlags, find_checkpoint, make_env, make_policy
 from mjlab.tasks.registry import load_rl_cfg
 
 
 @dataclass
-class EvaluateConfig:
+class EvaluateConfig(PolicyFlags):
     """Flags of `evaluate`."""
 
-    agent: Literal["trained", "zero", "random"] = "trained"
-    """Who acts: a trained policy, all-zero actions, or uniform ones in [-1, 1]."""
-    checkpoint_file: str | None = None
-    """Checkpoint to score; None takes the newest of the task."""
-    wandb_run_path: str | None = None
-    """Weights & Biases run to take the policy from, as entity/project/run."""
-    wandb_checkpoint_name: str | None = None
-    """Checkpoint of that run; None takes the newest."""
     num_episodes: int = 256
     """Episodes to play, one in each environment."""
     max_steps: int | None = None
     """Steps after which an episode is cut off; None is the task's episode length."""
     seed: int = 0
     """Seed of the evaluation."""
-    device: str | None = None
-    """Torch device; None takes a GPU where there is one."""
-    engine: Literal["auto", "native", "warp"] | None = None
-    """Physics engine."""
     json: bool = False
     """Print only JSON."""
-    log_root: str = "logs/rsl_rl"
-    """Folder of all runs."""
 
 
 def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
@@ -49,23 +35,12 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
     if cfg.num_episodes < 1:
         raise UserError(f"--num-episodes is {cfg.num_episodes}; at least 1 has to be played.")
     device = resolve_device(cfg.device)
-    checkpoint = None
-    if cfg.agent == "trained":
-        checkpoint = find_checkpoint(
-            task,
-            cfg.log_root,
-            cfg.checkpoint_file,
-            cfg.wandb_run_path,
-            cfg.wandb_checkpoint_name,
-        )
+    checkpoint = find_checkpoint(task, cfg)
     env = make_env(task, device, cfg.num_episodes, cfg.engine, play=False, seed=cfg.seed)
     solved = load_rl_cfg(task).evaluation
     target = solved.solved_return if solved.success_return is None else solved.success_return
     try:
-        if checkpoint is None:
-            policy = constant_policy(env, cfg.agent)
-        else:
-            policy = load_policy(task, env, checkpoint, device)
+        policy = make_policy(task, env, cfg.agent, checkpoint, device)
         result = evaluate_policy(
             env,
             policy,

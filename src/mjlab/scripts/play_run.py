@@ -9,32 +9,21 @@ from typing import Any, Literal
 
 from mjlab.scripts.cli import UserError, resolve_device
 from mjlab.scripts.policy import (
-    constant_policy,
+    PolicyFlags,
     find_checkpoint,
     load_policy,
     make_env,
+    make_policy,
     without_terminations,
 )
 
 
 @dataclass
-class PlayConfig:
+class PlayConfig(PolicyFlags):
     """Flags of `play`."""
 
-    agent: Literal["zero", "random", "trained"] = "trained"
-    """Who acts: all-zero actions, uniform ones in [-1, 1], or a trained policy."""
-    wandb_run_path: str | None = None
-    """Weights & Biases run to take the policy from, as entity/project/run."""
-    wandb_checkpoint_name: str | None = None
-    """Checkpoint of that run; None takes the newest."""
-    checkpoint_file: str | None = None
-    """Checkpoint to play; None takes the newest of the task."""
     num_envs: int | None = None
     """Number of environments; None keeps the task's."""
-    device: str | None = None
-    """Torch device; None takes a GPU where there is one."""
-    engine: Literal["auto", "native", "warp"] | None = None
-    """Physics engine."""
     video: bool = False
     """Record a clip instead of opening a viewer."""
     video_length: int = 200
@@ -58,8 +47,6 @@ class PlayConfig:
     """Port that the page is served on."""
     no_terminations: bool = False
     """Switch off every termination, the time limit included."""
-    log_root: str = "logs/rsl_rl"
-    """Folder of all runs."""
 
 
 def run_play(task: str, cfg: PlayConfig) -> None:
@@ -74,15 +61,7 @@ def run_play(task: str, cfg: PlayConfig) -> None:
     if cfg.viewer == "none" and cfg.num_steps is None and not cfg.video:
         raise UserError("--viewer none needs --num-steps, because nothing else would end it.")
     device = resolve_device(cfg.device)
-    checkpoint = None
-    if cfg.agent == "trained":
-        checkpoint = find_checkpoint(
-            task,
-            cfg.log_root,
-            cfg.checkpoint_file,
-            cfg.wandb_run_path,
-            cfg.wandb_checkpoint_name,
-        )
+    checkpoint = find_checkpoint(task, cfg)
     if cfg.video:
         _record(task, cfg, checkpoint, device)
         return
@@ -90,7 +69,7 @@ def run_play(task: str, cfg: PlayConfig) -> None:
     env = make_env(task, device, cfg.num_envs, cfg.engine, edit=edit)
     print(f"Physics:    {env.unwrapped.sim.capabilities.description}")
     try:
-        policy = _policy(task, cfg, env, checkpoint, device)
+        policy = make_policy(task, env, cfg.agent, checkpoint, device)
         if cfg.viewer == "none" and cfg.num_steps is not None:
             _play_headless(env, policy, cfg.num_steps)
         else:
@@ -98,12 +77,6 @@ def run_play(task: str, cfg: PlayConfig) -> None:
             viewer.run(num_steps=cfg.num_steps)
     finally:
         env.close()
-
-
-def _policy(task: str, cfg: PlayConfig, env: Any, checkpoint: Path | None, device: str) -> Any:
-    if checkpoint is None:
-        return constant_policy(env, cfg.agent)
-    return load_policy(task, env, checkpoint, device)
 
 
 def _play_headless(env: Any, policy: Any, num_steps: int) -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from mjlab.scripts.cli import UserError, tell
 from mjlab.scripts.run_folder import named_checkpoint, newest_checkpoint, read_agent_params
@@ -16,6 +16,37 @@ if TYPE_CHECKING:
 
 # Entries of the learner's config that say what the networks are and which observations they get.
 _NETWORKS = ("actor", "critic", "obs_groups")
+
+
+@dataclass
+class PolicyFlags:
+    """Flags that say whose actions are taken, and on what they are computed."""
+
+    agent: Literal["zero", "random", "trained"] = "trained"
+    """Who acts: all-zero actions, uniform ones in [-1, 1], or a trained policy."""
+    checkpoint_file: str | None = None
+    """Checkpoint of the trained policy; None takes the newest of the task."""
+    wandb_run_path: str | None = None
+    """Weights & Biases run to take the policy from, as entity/project/run."""
+    wandb_checkpoint_name: str | None = None
+    """Checkpoint of that run; None takes the newest."""
+    device: str | None = None
+    """Torch device; None takes a GPU where there is one."""
+    engine: Literal["auto", "native", "warp"] | None = None
+    """Physics engine."""
+    log_root: str = "logs/rsl_rl"
+    """Folder of all runs."""
+
+
+def make_policy(task: str, env: Any, agent: str, checkpoint: Path | None, device: str) -> Any:
+    """Return the policy in `checkpoint`, or where there is none the constant one of `agent`.
+
+    Raises:
+        CheckpointError: see `load_policy`.
+    """
+    if checkpoint is None:
+        return constant_policy(env, agent)
+    return load_policy(task, env, checkpoint, device)
 
 
 def load_policy(task: str, env: Any, checkpoint: Path, device: str) -> Any:
@@ -42,25 +73,24 @@ def _agent_cfg(task: str, checkpoint: Path) -> dict[str, Any]:
     return cfg | {name: saved[name] for name in _NETWORKS if name in saved and name in cfg}
 
 
-def find_checkpoint(
-    task: str,
-    log_root: str,
-    checkpoint_file: str | None,
-    wandb_run_path: str | None,
-    wandb_checkpoint_name: str | None,
-) -> Path:
+def find_checkpoint(task: str, flags: PolicyFlags) -> Path | None:
     """Return the checkpoint that the flags name, or the newest one of the task.
+
+    None where the flags ask for no trained policy.
 
     Raises:
         UserError: there is none.
     """
-    if checkpoint_file is not None:
-        return named_checkpoint(Path(checkpoint_file), task)
-    experiment = Path(log_root).resolve() / load_rl_cfg(task).experiment_name
-    if wandb_run_path is not None:
+    if flags.agent != "trained":
+        return None
+    if flags.checkpoint_file is not None:
+        return named_checkpoint(Path(flags.checkpoint_file), task)
+    experiment = Path(flags.log_root).resolve() / load_rl_cfg(task).experiment_name
+    if flags.wandb_run_path is not None:
         from mjlab.utils.os import get_wandb_checkpoint_path
 
-        return get_wandb_checkpoint_path(experiment, Path(wandb_run_path), wandb_checkpoint_name)[0]
+        run = Path(flags.wandb_run_path)
+        return get_wandb_checkpoint_path(experiment, run, flags.wandb_checkpoint_name)[0]
     path = newest_checkpoint(experiment, task)
     if path is None:
         raise UserError(

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from mjlab.scripts.policy import (
-    constant_policy,
-    load_policy,
     make_env,
+    make_policy,
     without_terminations,
 )
 
@@ -67,10 +66,8 @@ def record_policy(
 
     env = make_env(task, device, video.num_envs, video.engine, render_mode="rgb_array", edit=edit)
     try:
-        if checkpoint is None:
-            policy, name = constant_policy(env, video.agent), video.agent
-        else:
-            policy, name = load_policy(task, env, checkpoint, device), checkpoint.stem
+        policy = make_policy(task, env, video.agent, checkpoint, device)
+        name = video.agent if checkpoint is None else checkpoint.stem
         writer = ClipWriter(
             folder / f"{task}-{name}.{video.suffix}", env.unwrapped.metadata["render_fps"]
         )

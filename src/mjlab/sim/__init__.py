@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mjlab.sim.config import MujocoCfg as MujocoCfg
 from mjlab.sim.config import SimulationCfg as SimulationCfg
+from mjlab.utils.lazy import lazy_names
 
 if TYPE_CHECKING:
     from mjlab.sim.sim_data import TorchArray as TorchArray
@@ -18,11 +19,5 @@ _LAZY = {
     "WarpBridge": "mjlab.sim.sim_data",
 }
 
-
-def __getattr__(name: str) -> Any:
-    # Configs are imported by every task, the simulation only by a run: torch loads with the run.
-    if name in _LAZY:
-        import importlib
-
-        return getattr(importlib.import_module(_LAZY[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+# Configs are imported by every task, the simulation only by a run: torch loads with the run.
+__getattr__ = lazy_names(__name__, _LAZY)

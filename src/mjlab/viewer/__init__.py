@@ -6,8 +6,9 @@ MuJoCo, torch or viser.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mjlab.utils.lazy import lazy_names
 
 if TYPE_CHECKING:
     from mjlab.viewer.base import BaseViewer as BaseViewer
@@ -38,8 +39,4 @@ _HOMES = {
 
 __all__ = sorted(_HOMES)
 
-
-def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        return getattr(importlib.import_module(_HOMES[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazy_names(__name__, _HOMES)

@@ -11,24 +11,8 @@ from typing import Any
 from mjlab.compat import older_exports, older_names
 from mjlab.entity import Entity
 from mjlab.envs.mdp import dr
-from mjlab.envs.mdp.actions import (
-    JointEffortAction,
-    JointEffortActionCfg,
-    JointPositionAction,
-    JointPositionActionCfg,
-    JointVelocityAction,
-    JointVelocityActionCfg,
-    RelativeJointPositionAction,
-    RelativeJointPositionActionCfg,
-    SiteEffortAction,
-    SiteEffortActionCfg,
-    TendonEffortAction,
-    TendonEffortActionCfg,
-    TendonLengthAction,
-    TendonLengthActionCfg,
-    TendonVelocityAction,
-    TendonVelocityActionCfg,
-)
+from mjlab.envs.mdp.actions import *  # noqa: F403
+from mjlab.envs.mdp.actions import __all__ as _action_names
 from mjlab.envs.mdp.curriculums import (
     RewardCurriculumStage,
     TerminationCurriculumStage,
@@ -102,26 +86,10 @@ from mjlab.utils.nan_guard import (
 __all__ = [
     "BuiltinSensor",
     "Entity",
-    "JointEffortAction",
-    "JointEffortActionCfg",
-    "JointPositionAction",
-    "JointPositionActionCfg",
-    "JointVelocityAction",
-    "JointVelocityActionCfg",
     "NanGuard",
-    "RelativeJointPositionAction",
-    "RelativeJointPositionActionCfg",
     "RewardCurriculumStage",
     "RewardTermCfg",
     "SceneEntityCfg",
-    "SiteEffortAction",
-    "SiteEffortActionCfg",
-    "TendonEffortAction",
-    "TendonEffortActionCfg",
-    "TendonLengthAction",
-    "TendonLengthActionCfg",
-    "TendonVelocityAction",
-    "TendonVelocityActionCfg",
     "TerminationCurriculumStage",
     "action_acc_l2",
     "action_rate_l2",
@@ -163,6 +131,7 @@ __all__ = [
     "sample_uniform",
     "termination_curriculum",
     "time_out",
+    *_action_names,
     *older_exports(__name__),
 ]
 

@@ -18,6 +18,12 @@ import numpy as np
 import torch
 
 from mjlab.sim.engine import ROTATION_MATRICES, Capabilities, Engine, EngineUnavailableError
+from mjlab.sim.engines.field_lists import (
+    CONSTANTS_AT_QPOS0,
+    FIXED_CONSTANTS,
+    INPUTS,
+    ZERO_INPUTS,
+)
 from mjlab.sim.engines.sensor_fed import refuse_without_sensor
 
 if TYPE_CHECKING:
@@ -26,43 +32,11 @@ if TYPE_CHECKING:
 # State components that physics itself changes: bound from the start, so that `reset` can reach
 # them. The others change only by being written, and whoever writes them binds them first.
 _ALWAYS_BOUND = ("time", "qpos", "qvel", "act", "qacc_warmstart", "ctrl")
-_ZERO_ON_RESET = (
-    "time",
-    "qvel",
-    "act",
-    "qacc_warmstart",
-    "ctrl",
-    "qfrc_applied",
-    "xfrc_applied",
-    "userdata",
-    "qacc",
-    "act_dot",
-    "sensordata",
-)
-_OUTPUT_FIELDS = frozenset({"qacc", "act_dot", "sensordata"})
-_INPUT_FIELDS = (
-    frozenset((*_ZERO_ON_RESET, "qpos", "eq_active", "mocap_pos", "mocap_quat")) - _OUTPUT_FIELDS
-)
+_RESULTS_ZERO_ON_RESET = ("qacc", "act_dot", "sensordata")
 
-# What mj_setConst writes. `Batch.set_const` would bind these as double; they are expanded as
-# float32 first, so that they can be read through the seam.
-_DERIVED_CONSTANTS = (
-    "body_subtreemass",
-    "body_invweight0",
-    "dof_invweight0",
-    "dof_M0",
-    "tendon_length0",
-    "tendon_invweight0",
-    "actuator_acc0",
-    "actuator_biasprm",
-    "eq_data",
-    "cam_pos0",
-    "cam_poscom0",
-    "cam_mat0",
-    "light_pos0",
-    "light_poscom0",
-    "light_dir0",
-)
+# `Batch.set_const` would bind these as double; they are expanded as float32 first, so that they
+# can be read through the seam.
+_DERIVED_CONSTANTS = (*FIXED_CONSTANTS, *CONSTANTS_AT_QPOS0, "dof_M0")
 
 # The compiler marks frames that coincide and MuJoCo then skips their transforms, so the marks
 # have to go before such a frame is randomized.
@@ -133,7 +107,7 @@ class NativeEngine(Engine):
         if name not in self._tensors:
             refuse_without_sensor(self._model, name)
             tensor = self._bind(name)
-            if name not in _INPUT_FIELDS and tensor.numel():
+            if name not in INPUTS and tensor.numel():
                 self._fill(name)
         return self._tensors[name]
 
@@ -158,7 +132,7 @@ class NativeEngine(Engine):
     def _bind(self, name: str) -> torch.Tensor:
         array = _as_float32(self._batch.bind, name, "MjData")
         self._arrays[name] = array
-        if name not in _INPUT_FIELDS:
+        if name not in INPUTS:
             self._derived.add(name)
         self._tensors[name] = _as_tensor(name, array)
         return self._tensors[name]
@@ -217,13 +191,16 @@ class NativeEngine(Engine):
         # are still pending (an action sent to an environment that now starts over) and would
         # recompute derived fields that terms still read.
         rows: Any = slice(None) if env_ids is None else env_ids
-        for name in _ZERO_ON_RESET:
+        for name in (*ZERO_INPUTS, *_RESULTS_ZERO_ON_RESET):
             if name in self._tensors:
                 self._tensors[name][rows] = 0
         qpos0 = self._model_tensors.get("qpos0")
         self._tensors["qpos"][rows] = self._qpos0 if qpos0 is None else qpos0[rows]
+        # The warm start goes in the state rows too: a forward pass that must not change it keeps
+        # what stands there.
+        chosen = slice(None) if env_ids is None else env_ids.numpy()
+        self._batch.bind("state")[chosen, self._warm_start] = 0.0
         if self._history0.size:
-            chosen = slice(None) if env_ids is None else env_ids.numpy()
             self._batch.bind("state")[chosen, self._history] = self._history0
         if "eq_active" in self._tensors:
             self._tensors["eq_active"][rows] = self._eq_active0
@@ -300,7 +277,7 @@ class NativeEngine(Engine):
         state = self._batch.bind("state")[env_idx]
         mujoco.mj_setState(self._model, mj_data, state, int(mujoco.mjtState.mjSTATE_INTEGRATION))
         # Values written since the last call are not in the state row yet.
-        for name in _INPUT_FIELDS & self._arrays.keys():
+        for name in self._arrays.keys() & INPUTS:
             value = self._arrays[name][env_idx]
             if name == "time":
                 mj_data.time = float(value)

@@ -26,6 +26,12 @@ from mjlab.sim.engine import (
     Engine,
     EngineUnavailableError,
 )
+from mjlab.sim.engines.field_lists import (
+    CONSTANTS_AT_QPOS0,
+    FIXED_CONSTANTS,
+    INPUTS,
+    ZERO_INPUTS,
+)
 from mjlab.sim.engines.sensor_fed import refuse_without_sensor
 from mjlab.sim.engines.warp_fields import find_data_field, find_model_field
 from mjlab.sim.engines.warp_support import (
@@ -45,24 +51,7 @@ mjwarp: Any = mujoco_warp
 wp: Any = warp
 
 # What the next step depends on. `reset` sets all of it, and a saved state is made of it.
-_ZERO_ON_RESET = (
-    "time",
-    "qvel",
-    "act",
-    "qacc_warmstart",
-    "ctrl",
-    "qfrc_applied",
-    "xfrc_applied",
-    "userdata",
-)
-_STATE_FIELDS = (
-    *_ZERO_ON_RESET,
-    "qpos",
-    "eq_active",
-    "mocap_pos",
-    "mocap_quat",
-    "history",
-)
+_STATE_FIELDS = (*INPUTS, "history")
 # Results that MuJoCo's reset clears too. Poses and velocities keep their values until `forward`.
 _RESULTS_ZERO_ON_RESET = (
     "qacc",
@@ -78,21 +67,6 @@ _RESULTS_ZERO_ON_RESET = (
 _STATIC_POSE = frozenset({"body_pos", "body_quat", "geom_pos", "geom_quat"})
 
 _RECOMPUTE = {1: mjwarp.set_const_fixed, 2: mjwarp.set_const_0, 3: mjwarp.set_const}
-_CONSTANTS_AT_QPOS0 = (
-    "dof_invweight0",
-    "body_invweight0",
-    "tendon_length0",
-    "tendon_invweight0",
-    "actuator_acc0",
-    "actuator_biasprm",
-    "eq_data",
-    "cam_pos0",
-    "cam_poscom0",
-    "cam_mat0",
-    "light_pos0",
-    "light_poscom0",
-    "light_dir0",
-)
 # Substeps in one captured graph at most; longer runs replay the graph of a single substep.
 _MAX_CAPTURED_STEPS = 16
 
@@ -270,9 +244,9 @@ class WarpEngine(Engine):
     def constants_written_by(self, level: int) -> tuple[str, ...]:
         names: tuple[str, ...] = ()
         if level in (1, 3):
-            names += ("body_subtreemass",)
+            names += FIXED_CONSTANTS
         if level in (2, 3):
-            names += _CONSTANTS_AT_QPOS0
+            names += CONSTANTS_AT_QPOS0
         return tuple(name for name in names if getattr(self.wp_model, name).size)
 
     def recompute_constants(self, level: int, env_ids: torch.Tensor | None) -> None:
@@ -370,7 +344,7 @@ class WarpEngine(Engine):
     def reset(self, env_ids: torch.Tensor | None) -> None:
         # `mjwarp.reset_data` clears the contacts of all environments together with those of the
         # first, and only as many activations as there are controls; so each field is reset here.
-        for name in (*_ZERO_ON_RESET, *_RESULTS_ZERO_ON_RESET):
+        for name in (*ZERO_INPUTS, *_RESULTS_ZERO_ON_RESET):
             tensor = self.data_field(name)
             tensor.zero_() if env_ids is None else tensor.index_fill_(0, env_ids, 0)
         _set_rows(self.data_field("qpos"), env_ids, as_torch(self.wp_model.qpos0))

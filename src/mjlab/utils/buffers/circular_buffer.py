@@ -20,7 +20,7 @@ class CircularBuffer:
     taken to have been constant.
     """
 
-    _transient = frozenset({"_rows"})
+    _transient = frozenset({"_rows", "_max_len", "_batch_size"})
 
     def __init__(self, max_len: int, batch_size: int, device: str) -> None:
         """Make an empty buffer. Raises `ValueError` if `max_len` is less than 1."""

@@ -18,6 +18,20 @@ class DelayBuffer:
     `hold_prob`. A lag that goes back before the first frame gives the first frame.
     """
 
+    # Settings come from the config; a run that resumes may have changed them on purpose.
+    _transient = frozenset(
+        {
+            "_min_lag",
+            "_max_lag",
+            "_batch_size",
+            "_per_env",
+            "_hold_prob",
+            "_update_period",
+            "_random_phase",
+            "_num_draws",
+        }
+    )
+
     def __init__(
         self,
         min_lag: int = 0,

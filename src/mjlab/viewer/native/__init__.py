@@ -5,8 +5,9 @@ The window is loaded on first use: the offscreen renderer needs the drawing only
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mjlab.utils.lazy import lazy_names
 
 if TYPE_CHECKING:
     from mjlab.viewer.native.viewer import NativeMujocoViewer as NativeMujocoViewer
@@ -21,8 +22,4 @@ _HOMES = {
 
 __all__ = sorted(_HOMES)
 
-
-def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        return getattr(importlib.import_module(_HOMES[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazy_names(__name__, _HOMES)
