@@ -32,8 +32,10 @@ def _command(argv: list[str]) -> None:
     task, flags = task_and_flags(argv, _USAGE)
     from mjlab.scripts.cli import parse_flags
     from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
+    from mjlab.tasks.registry import load_env_cfg
 
-    run_evaluate(task, parse_flags(EvaluateConfig, EvaluateConfig(), flags, f"evaluate {task}"))
+    default = EvaluateConfig(env=load_env_cfg(task))
+    run_evaluate(task, parse_flags(EvaluateConfig, default, flags, f"evaluate {task}"))
 
 
 def main() -> None:

@@ -7,7 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from mjlab.scripts.cli import UserError, resolve_device
-from mjlab.scripts.policy import PolicyFlags, find_checkpoint, make_env, make_policy
+from mjlab.scripts.policy import (
+    PolicyFlags,
+    env_cfg_of,
+    find_checkpoint,
+    make_env,
+    make_policy,
+)
 from mjlab.tasks.registry import load_rl_cfg
 
 
@@ -36,7 +42,8 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
         raise UserError(f"--num-episodes is {cfg.num_episodes}; at least 1 has to be played.")
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
-    env = make_env(task, device, cfg.num_episodes, cfg.engine, play=False, seed=cfg.seed)
+    env_cfg = env_cfg_of(task, cfg, play=False)
+    env = make_env(task, env_cfg, device, cfg.num_episodes, cfg.engine, seed=cfg.seed)
     solved = load_rl_cfg(task).evaluation
     target = solved.solved_return if solved.success_return is None else solved.success_return
     try:

@@ -34,8 +34,10 @@ def _command(argv: list[str]) -> None:
     task, flags = task_and_flags(argv, _USAGE)
     from mjlab.scripts.cli import parse_flags
     from mjlab.scripts.play_run import PlayConfig, run_play
+    from mjlab.tasks.registry import load_env_cfg
 
-    run_play(task, parse_flags(PlayConfig, PlayConfig(), flags, prog=f"play {task}"))
+    default = PlayConfig(env=load_env_cfg(task, play=True))
+    run_play(task, parse_flags(PlayConfig, default, flags, prog=f"play {task}"))
 
 
 def main() -> None:

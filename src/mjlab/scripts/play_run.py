@@ -5,17 +5,20 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from mjlab.scripts.cli import UserError, resolve_device
 from mjlab.scripts.policy import (
     PolicyFlags,
+    env_cfg_of,
     find_checkpoint,
     load_policy,
     make_env,
     make_policy,
-    without_terminations,
 )
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnvCfg
 
 
 @dataclass
@@ -60,13 +63,19 @@ def run_play(task: str, cfg: PlayConfig) -> None:
         raise UserError(f"--num-steps is {cfg.num_steps}; it has to be at least 1.")
     if cfg.viewer == "none" and cfg.num_steps is None and not cfg.video:
         raise UserError("--viewer none needs --num-steps, because nothing else would end it.")
+    if cfg.video_length < 1:
+        raise UserError(f"--video-length is {cfg.video_length}; it has to be at least 1.")
+    if not 1 <= cfg.port <= 65535:
+        raise UserError(f"--port is {cfg.port}; ports go from 1 to 65535.")
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
+    env_cfg = env_cfg_of(task, cfg, play=True)
+    if cfg.no_terminations:
+        env_cfg.terminations = {}
     if cfg.video:
-        _record(task, cfg, checkpoint, device)
+        _record(task, cfg, env_cfg, checkpoint, device)
         return
-    edit = without_terminations if cfg.no_terminations else None
-    env = make_env(task, device, cfg.num_envs, cfg.engine, edit=edit)
+    env = make_env(task, env_cfg, device, cfg.num_envs, cfg.engine)
     print(f"Physics:    {env.unwrapped.sim.capabilities.description}")
     try:
         policy = make_policy(task, env, cfg.agent, checkpoint, device)
@@ -113,12 +122,19 @@ def _make_viewer(
     return viewer
 
 
-def _record(task: str, cfg: PlayConfig, checkpoint: Path | None, device: str) -> None:
+def _record(
+    task: str,
+    cfg: PlayConfig,
+    env_cfg: ManagerBasedRlEnvCfg,
+    checkpoint: Path | None,
+    device: str,
+) -> None:
     from mjlab.scripts.record import VideoCfg, record_policy
 
     folder = Path("videos") if checkpoint is None else checkpoint.parent / "videos" / "play"
     record_policy(
         task,
+        env_cfg,
         checkpoint,
         folder,
         device,
@@ -131,6 +147,5 @@ def _record(task: str, cfg: PlayConfig, checkpoint: Path | None, device: str) ->
             num_envs=cfg.num_envs,
             engine=cfg.engine,
             agent=cfg.agent,
-            no_terminations=cfg.no_terminations,
         ),
     )

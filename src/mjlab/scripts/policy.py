@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.scripts.cli import UserError, tell
 from mjlab.scripts.run_folder import named_checkpoint, newest_checkpoint, read_agent_params
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 
-if TYPE_CHECKING:
-    from mjlab.envs import ManagerBasedRlEnvCfg
+# What a run's own settings may change about the task's networks: sizes and switches. Names of
+# classes never come from a file, because rsl_rl would import and call whatever they name.
+_SIZES: dict[str, Callable[[Any], bool]] = {
+    "hidden_dims": lambda value: isinstance(value, list) and all(_is_count(v) for v in value),
+    "activation": lambda value: isinstance(value, str) and value.isidentifier(),
+    "obs_normalization": lambda value: isinstance(value, bool),
+    "rnn_type": lambda value: value in (None, "lstm", "gru"),
+    "rnn_hidden_dim": lambda value: _is_count(value),
+    "rnn_num_layers": lambda value: _is_count(value),
+}
 
-# Entries of the learner's config that say what the networks are and which observations they get.
-_NETWORKS = ("actor", "critic", "obs_groups")
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and value > 0
 
 
 @dataclass
@@ -36,6 +47,8 @@ class PolicyFlags:
     """Physics engine."""
     log_root: str = "logs/rsl_rl"
     """Folder of all runs."""
+    env: ManagerBasedRlEnvCfg | None = None
+    """The environment; None takes the task's config."""
 
 
 def make_policy(task: str, env: Any, agent: str, checkpoint: Path | None, device: str) -> Any:
@@ -70,7 +83,14 @@ def _agent_cfg(task: str, checkpoint: Path) -> dict[str, Any]:
     """
     cfg = asdict(load_rl_cfg(task))
     saved = read_agent_params(checkpoint.parent)
-    return cfg | {name: saved[name] for name in _NETWORKS if name in saved and name in cfg}
+    for network in ("actor", "critic"):
+        sizes = saved.get(network)
+        if not isinstance(sizes, dict):
+            continue
+        for name, is_valid in _SIZES.items():
+            if name in sizes and name in cfg[network] and is_valid(sizes[name]):
+                cfg[network][name] = sizes[name]
+    return cfg
 
 
 def find_checkpoint(task: str, flags: PolicyFlags) -> Path | None:
@@ -114,34 +134,28 @@ def constant_policy(env: Any, kind: str) -> Any:
 
 def make_env(
     task: str,
+    cfg: ManagerBasedRlEnvCfg,
     device: str,
     num_envs: int | None = None,
     engine: Any = None,
     *,
-    play: bool = True,
     seed: int | None = None,
     render_mode: str | None = None,
-    edit: Callable[[ManagerBasedRlEnvCfg], None] | None = None,
 ) -> Any:
-    """Return the wrapped environment of the task's play or training config.
-
-    What is None is left as the task has it; `edit` may change the config further.
-    """
+    """Return the wrapped environment of `cfg`; what is None is left as `cfg` has it."""
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.rl import RslRlVecEnvWrapper
 
-    cfg = load_env_cfg(task, play=play)
-    cfg.seed = seed
+    cfg = copy.deepcopy(cfg)
+    cfg.seed = cfg.seed if seed is None else seed
     if num_envs is not None:
         cfg.scene.num_envs = num_envs
     if engine is not None:
         cfg.sim.engine = engine
-    if edit is not None:
-        edit(cfg)
     env = ManagerBasedRlEnv(cfg, device=device, render_mode=render_mode)
     return RslRlVecEnvWrapper(env, clip_actions=load_rl_cfg(task).clip_actions)
 
 
-def without_terminations(cfg: ManagerBasedRlEnvCfg) -> None:
-    """Switch off every termination of `cfg`, the time limit included."""
-    cfg.terminations = {}
+def env_cfg_of(task: str, flags: PolicyFlags, *, play: bool) -> ManagerBasedRlEnvCfg:
+    """Return the environment config in `flags`, or the task's own to `play` or to train with."""
+    return load_env_cfg(task, play=play) if flags.env is None else flags.env

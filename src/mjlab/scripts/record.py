@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mjlab.scripts.policy import (
-    make_env,
-    make_policy,
-    without_terminations,
-)
+from mjlab.scripts.policy import make_env, make_policy
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -36,12 +33,11 @@ class VideoCfg:
     """Physics engine; None keeps the task's."""
     agent: str = "trained"
     """Who acts where there is no checkpoint: `zero` or `random`."""
-    no_terminations: bool = False
-    """Whether terminations are switched off."""
 
 
 def record_policy(
     task: str,
+    env_cfg: ManagerBasedRlEnvCfg,
     checkpoint: Path | None,
     folder: Path,
     device: str,
@@ -58,13 +54,10 @@ def record_policy(
 
     video = video or VideoCfg()
 
-    def edit(cfg: ManagerBasedRlEnvCfg) -> None:
-        cfg.viewer.height = video.height or cfg.viewer.height
-        cfg.viewer.width = video.width or cfg.viewer.width
-        if video.no_terminations:
-            without_terminations(cfg)
-
-    env = make_env(task, device, video.num_envs, video.engine, render_mode="rgb_array", edit=edit)
+    env_cfg = copy.deepcopy(env_cfg)
+    env_cfg.viewer.height = video.height or env_cfg.viewer.height
+    env_cfg.viewer.width = video.width or env_cfg.viewer.width
+    env = make_env(task, env_cfg, device, video.num_envs, video.engine, render_mode="rgb_array")
     try:
         policy = make_policy(task, env, video.agent, checkpoint, device)
         name = video.agent if checkpoint is None else checkpoint.stem

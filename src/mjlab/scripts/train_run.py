@@ -252,7 +252,9 @@ def _leave_results(task: str, cfg: TrainConfig, run_dir: Path, device: str) -> N
         from mjlab.viewer.errors import RenderingUnavailableError
 
         try:
-            record_policy(task, checkpoint, run_dir / "videos", device)
+            record_policy(
+                task, load_env_cfg(task, play=True), checkpoint, run_dir / "videos", device
+            )
         except RenderingUnavailableError as error:
             print(f"No video: {error}")
     print("Results:")

@@ -1,0 +1,86 @@
+"""What a run's own files may say about its policy."""
+
+from __future__ import annotations
+
+import pytest
+import yaml
+
+from mjlab.scripts.policy import _agent_cfg, constant_policy
+from mjlab.tasks.registry import load_rl_cfg
+
+TASK = "Mjlab-Cartpole-Swingup"
+
+
+def agent_cfg_beside(folder, params):
+    (folder / "params").mkdir()
+    (folder / "params" / "agent.yaml").write_text(yaml.safe_dump(params))
+    return _agent_cfg(TASK, folder / "model_1.pt")
+
+
+def test_sizes_of_the_run_replace_those_of_the_task(tmp_path):
+    cfg = agent_cfg_beside(
+        tmp_path, {"actor": {"hidden_dims": [8, 4], "activation": "relu", "rnn_num_layers": 2}}
+    )
+    assert cfg["actor"]["hidden_dims"] == [8, 4]
+    assert cfg["actor"]["activation"] == "relu"
+    assert cfg["actor"]["rnn_num_layers"] == 2
+    assert cfg["critic"] == agent_cfg_of_task()["critic"]
+
+
+def agent_cfg_of_task():
+    from dataclasses import asdict
+
+    return asdict(load_rl_cfg(TASK))
+
+
+@pytest.mark.parametrize(
+    "actor",
+    [
+        {"class_name": "pydoc:pipepager"},
+        {"distribution_cfg": {"class_name": "pydoc:pipepager", "cmd": "touch pwned"}},
+        {"cnn_cfg": {"class_name": "os:system"}},
+        {"hidden_dims": "nonsense"},
+        {"hidden_dims": [64, -1]},
+        {"activation": "os:system"},
+        {"obs_normalization": "yes"},
+        {"rnn_type": "subprocess:run"},
+        3,
+        None,
+    ],
+)
+def test_nothing_else_in_a_run_folder_reaches_the_networks(tmp_path, actor):
+    params = {"actor": actor, "obs_groups": {"actor": ["os:system"]}, "class_name": "os:system"}
+    assert agent_cfg_beside(tmp_path, params) == agent_cfg_of_task()
+
+
+def test_a_run_folder_that_says_nothing_leaves_the_task_as_it_is(tmp_path):
+    assert _agent_cfg(TASK, tmp_path / "model_1.pt") == agent_cfg_of_task()
+
+
+def test_constant_policies_have_the_shape_of_the_actions():
+    from types import SimpleNamespace
+
+    env = SimpleNamespace(num_envs=3, num_actions=2, device="cpu")
+    assert constant_policy(env, "zero")(None).abs().sum() == 0
+    random = constant_policy(env, "random")(None)
+    assert random.shape == (3, 2)
+    assert random.abs().max() <= 1
+
+
+def test_fields_of_the_environment_are_flags_of_evaluate_and_play(run):
+    zero = ("--agent", "zero", "--env.episode-length-s", "0.5")
+    scored = run("evaluate", TASK, *zero, "--num-episodes", "4", "--json", "True")
+    assert scored.status == 0
+    assert '"mean_length": 10.0' in scored.out
+    played = run("play", TASK, *zero, "--viewer", "none", "--num-steps", "30", "--num-envs", "2")
+    assert played.status == 0
+    assert "6 episodes ended" in played.out
+
+
+@pytest.mark.parametrize(
+    ("flag", "value"), [("--port", "99999"), ("--port", "0"), ("--video-length", "0")]
+)
+def test_numbers_of_play_that_cannot_be_are_refused(run, flag, value):
+    outcome = run("play", TASK, "--agent", "zero", flag, value)
+    assert outcome.status == 1
+    assert f"{flag} is {value}" in outcome.message
