@@ -8,6 +8,7 @@ import io
 import pytest
 from rich.console import Console
 
+from mjlab.rl.evaluate import EvaluationResult
 from mjlab.rl.progress import IterationStats
 from mjlab.scripts import display
 from mjlab.scripts.display import TrainingDisplay, duration
@@ -55,6 +56,24 @@ def test_lines_are_rare_but_the_first_and_the_last_are_there(monkeypatch):
 
 def test_a_log_file_gets_no_control_codes():
     assert "\x1b" not in shown(1, 10)
+
+
+def test_how_an_evaluation_went_is_one_line_in_a_log_file():
+    out = io.StringIO()
+    result = EvaluationResult(
+        num_episodes=64,
+        mean_return=512.5,
+        return_interval=(500.0, 525.0),
+        std_return=20.0,
+        min_return=450.0,
+        max_return=560.0,
+        mean_length=1000.0,
+    )
+    panel = TrainingDisplay("My-Task", Console(file=out, width=40))
+    panel.on_evaluation(120, result, solved=False)
+    assert out.getvalue() == (
+        "Evaluation after 120 iterations: mean return 512.5 over 64 episodes, not solved yet.\n"
+    )
 
 
 @pytest.mark.parametrize(

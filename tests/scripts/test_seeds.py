@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
+import time
 
 import pytest
+from commands import SMALL
+
+from mjlab.scripts.run_folder import checkpoints_in, read_run_info, write_run_info
 
 TASK = "Mjlab-Cartpole-Swingup"
 
@@ -15,12 +21,12 @@ def commands(monkeypatch) -> list[list[str]]:
     """Return the commands that would be run; every one succeeds, but that of seed 13."""
     seen: list[list[str]] = []
 
-    def pretend(command, check):
+    def pretend(command):
         seen.append(command)
         failed = command[command.index("--agent.seed") + 1] == "13"
-        return subprocess.CompletedProcess(command, 3 if failed else 0)
+        return (3 if failed else 0), False
 
-    monkeypatch.setattr(subprocess, "run", pretend)
+    monkeypatch.setattr("mjlab.scripts.train_seeds.run_forwarding_signals", pretend)
     return seen
 
 
@@ -81,3 +87,92 @@ def test_what_is_no_run_is_named(run, trained, tmp_path):
     outcome = run("plot_seeds", str(empty), "--output", str(tmp_path / "x.png"))
     assert outcome.status == 1
     assert str(empty) in outcome.message
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_reaches_the_run_which_is_waited_for(tmp_path, name):
+    done = tmp_path / "saved"
+    child = (
+        "import signal, sys, time, pathlib\n"
+        "def save(*_):\n"
+        f"    time.sleep(0.5); pathlib.Path({str(done)!r}).touch(); sys.exit(0)\n"
+        f"signal.signal(signal.{name}, save)\n"
+        f"pathlib.Path({str(tmp_path / 'ready')!r}).touch()\n"
+        "time.sleep(30)\n"
+    )
+    parent = (
+        "import sys\n"
+        "from mjlab.scripts.train_seeds import run_forwarding_signals\n"
+        f"print(run_forwarding_signals([sys.executable, '-c', {child!r}]))\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 20
+    while not (tmp_path / "ready").exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(getattr(signal, name))
+    output, _ = process.communicate(timeout=20)
+    assert output.strip() == "(0, True)"
+    assert done.exists()
+
+
+def test_ctrl_c_saves_the_running_seed_and_ends_the_series(tmp_path):
+    command = [sys.executable, "-m", "mjlab.scripts.train_seeds", TASK, *SMALL[:-4]]
+    command += ["--log-root", str(tmp_path), "--agent.max-iterations", "1000000", "--seeds=2"]
+    command += ["--agent.save-interval", "1"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, process_group=0
+    )
+    end = time.monotonic() + 60
+    while not list(tmp_path.glob("cartpole/*/model_0.pt")) and time.monotonic() < end:
+        assert process.poll() is None, process.communicate()[0]
+        time.sleep(0.02)
+    # As a terminal does it: to the whole process group.
+    os.killpg(process.pid, signal.SIGINT)
+    out = process.communicate(timeout=60)[0]
+    assert process.returncode == 0, out
+    assert out.count("SIGINT: finishing this iteration, then saving") == 1
+    assert "Stopped during seed 1 of 2" in out
+    (run_dir,) = (tmp_path / "cartpole").iterdir()
+    info = read_run_info(run_dir)
+    assert info["ended"] == "interrupted"
+    assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"
+
+
+@pytest.mark.parametrize(("ended", "seeds"), [("interrupted", 1), ("finished", 3)])
+def test_a_run_interrupted_by_others_ends_the_series(run, tmp_path, monkeypatch, ended, seeds):
+    trained = []
+
+    def pretend(command):
+        trained.append(command)
+        run_dir = tmp_path / "mine" / f"2026-01-01_seed_{len(trained)}"
+        run_dir.mkdir(parents=True)
+        write_run_info(run_dir, ended=ended)
+        return 0, False
+
+    monkeypatch.setattr("mjlab.scripts.train_seeds.run_forwarding_signals", pretend)
+    older = tmp_path / "mine" / "2025-01-01_seed_1"
+    older.mkdir(parents=True)
+    write_run_info(older, ended="interrupted")
+    flags = (f"--log-root={tmp_path}", "--agent.experiment-name", "mine", "--seeds", "3")
+    outcome = run("train_seeds", TASK, *flags)
+    assert outcome.status == 0
+    assert len(trained) == seeds
+    assert ("Stopped during seed 1 of 3" in outcome.out) == (seeds == 1)
+
+
+def test_the_help_of_a_task_tells_of_seeds_and_the_flags_of_train(run, commands):
+    outcome = run("train_seeds", TASK, "--help")
+    assert outcome.status == 0
+    assert "--seeds N" in outcome.out
+    assert "--num-envs" in outcome.out
+    assert not commands
+
+
+def test_a_mistaken_flag_is_told_before_anything_is_trained(run, commands):
+    assert run("train_seeds", TASK, "--no-such-flag", "3").status == 2
+    assert not commands
+
+
+def test_seeds_may_be_given_with_an_equals_sign(run, commands):
+    assert run("train_seeds", TASK, "--seeds=2").status == 0
+    assert len(commands) == 2

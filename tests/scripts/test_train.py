@@ -116,14 +116,14 @@ def test_the_start_says_what_runs_where(run, tmp_path):
 def test_two_runs_begun_at_once_have_folders_of_their_own(train, tmp_path, monkeypatch):
     import datetime
 
-    from mjlab.scripts import train_run
+    from mjlab.scripts import run_folder
 
     class Stopped(datetime.datetime):
         @classmethod
         def now(cls, tz=None):
             return cls(2026, 1, 2, 3, 4, 5)
 
-    monkeypatch.setattr(train_run, "datetime", Stopped)
+    monkeypatch.setattr(run_folder, "datetime", Stopped)
     names = [train(tmp_path, 1).name for _ in range(2)]
     assert names == ["2026-01-02_03-04-05", "2026-01-02_03-04-05-2"]
 

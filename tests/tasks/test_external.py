@@ -122,6 +122,17 @@ def test_a_broken_package_is_reported_with_its_traceback_and_skipped(
         assert part in record.getMessage()
 
 
+def test_a_package_that_fails_half_way_leaves_none_of_its_tasks(install, caplog):
+    text = textwrap.dedent(REGISTERS.format(task="Half-Task")) + "\nregister()\nimport nowhere\n"
+    install("broken-package", {"first": "broken"}, {"broken.py": text})
+    tasks = registry.list_tasks()
+    assert "Half-Task" not in tasks
+    assert "Mjlab-Cartpole-Balance" in tasks
+    assert "No module named 'nowhere'" in caplog.text
+    with pytest.raises(registry.UnknownTaskError):
+        registry.load_env_cfg("Half-Task")
+
+
 OLD_STYLE = {
     "old_style/__init__.py": "",
     "old_style/tasks/__init__.py": """

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import pytest
 
+import mjlab.tasks
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl import MjlabOnPolicyRunner, RslRlOnPolicyRunnerCfg
 from mjlab.scene import SceneCfg
+from mjlab.scripts.cli import run_command
 from mjlab.tasks import registry
 from mjlab.tasks.registry import (
+    TaskImportError,
     UnknownTaskError,
     list_tasks,
     load_env_cfg,
@@ -90,3 +93,46 @@ def test_an_unknown_task_is_a_key_error_with_the_nearest_names(load):
         load("Mjlab-Cartpole-Balanse")
     assert isinstance(caught.value, KeyError)
     assert str(len(list_tasks())) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "cause"),
+    [
+        ("no_such_module_anywhere:make", "No module named 'no_such_module_anywhere'"),
+        ("mjlab.tasks.registry:no_such_function", "no_such_function"),
+    ],
+)
+def test_a_lazy_config_that_cannot_be_imported_names_the_task_and_the_cause(name, cause):
+    register_mjlab_task("Lazy-Task", name, None, name, name)
+    for load in (load_env_cfg, load_rl_cfg, load_runner_cls):
+        with pytest.raises(TaskImportError, match=f"'Lazy-Task' .*'{name}'.*{cause}") as caught:
+            load("Lazy-Task")
+        assert isinstance(caught.value.__cause__, (ImportError, AttributeError))
+
+
+def test_the_command_line_tells_of_such_a_task_in_one_message(monkeypatch, capsys):
+    register_mjlab_task("Lazy-Task", "no_such_module:make", rl_cfg="no_such_module:make")
+    monkeypatch.setattr("sys.argv", ["train", "Lazy-Task"])
+    with pytest.raises(SystemExit) as ended:
+        run_command(lambda argv: print(load_env_cfg(argv[0])))
+    assert ended.value.code == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: Task 'Lazy-Task' cannot be used")
+    assert "Traceback" not in error
+
+
+def test_a_subpackage_that_fails_to_import_leaves_no_task(monkeypatch, tmp_path, caplog):
+    package = tmp_path / "broken_tasks_of_test"
+    package.mkdir()
+    (package / "__init__.py").write_text(
+        "from mjlab.tasks.registry import register_mjlab_task\n"
+        "register_mjlab_task('Half-Task', object(), rl_cfg=object())\n"
+        "raise RuntimeError('half way')\n"
+    )
+    monkeypatch.setattr("mjlab.tasks.__path__", [*mjlab.tasks.__path__, str(tmp_path)])
+    monkeypatch.setattr(registry, "_discovered", False)
+    tasks = list_tasks()
+    assert "Half-Task" not in tasks
+    assert "Mjlab-Cartpole-Balance" in tasks
+    assert "half way" in caplog.text
+    assert "mjlab.tasks.broken_tasks_of_test" in caplog.text

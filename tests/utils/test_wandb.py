@@ -42,3 +42,14 @@ def test_a_run_may_have_no_tags_and_wandb_need_not_be_imported(wandb, monkeypatc
     add_wandb_tags(["c"])
     assert os.environ["WANDB_TAGS"] == "c"
     assert "wandb" not in sys.modules
+
+
+@pytest.mark.parametrize("present", [None, ""])
+def test_without_tags_the_variable_is_not_left_empty(monkeypatch, present):
+    # An empty variable is one empty tag to wandb, which refuses to start a run with it.
+    if present is None:
+        monkeypatch.delenv("WANDB_TAGS")
+    add_wandb_tags([])
+    assert "WANDB_TAGS" not in os.environ
+    add_wandb_tags(["", "a"])
+    assert os.environ["WANDB_TAGS"] == "a"

@@ -43,12 +43,18 @@ class RunLogger(Logger):
         Raises:
             RunFolderError: the run folder cannot be written to.
             ModuleNotFoundError: Weights & Biases is asked for and not installed.
+            ValueError: Weights & Biases did not start a run: nobody is logged in, and the like.
         """
         if self.log_dir is not None and not self.disable_logs:
             ensure_writable_folder(self.log_dir)
             self.cfg["logger"] = self._writer_config()
         with contextlib.redirect_stdout(io.StringIO()) as printed:
-            super().init_logging_writer()
+            try:
+                super().init_logging_writer()
+            except Exception as error:
+                if not _is_of_wandb(error):
+                    raise
+                raise ValueError(_wandb_message(error)) from error
         for line in filter(None, printed.getvalue().splitlines()):
             logger.debug("%s", line)
 
@@ -224,3 +230,17 @@ class RunLogger(Logger):
         self.lenbuffer.extend(state["lengths"])
         self.cur_reward_sum.copy_(state["reward_sums"])
         self.cur_episode_length.copy_(state["episode_lengths"])
+
+
+def _is_of_wandb(error: BaseException) -> bool:
+    # By name, because whoever does not log to it does not import wandb.
+    return any(cls.__module__.partition(".")[0] == "wandb" for cls in type(error).__mro__)
+
+
+def _wandb_message(error: BaseException) -> str:
+    reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+    return (
+        f"Weights & Biases did not start a run: {reason}. Log in with `wandb login`, or set "
+        "WANDB_API_KEY; WANDB_MODE=offline records without an account, and "
+        "--agent.logger tensorboard does without Weights & Biases."
+    )

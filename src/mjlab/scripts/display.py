@@ -67,6 +67,7 @@ class TrainingDisplay(TrainingObserver):
             f"Evaluation after {iteration} iterations: mean return {result.mean_return:.1f} over "
             f"{result.num_episodes} episodes, {verdict}.",
             highlight=False,
+            soft_wrap=True,
         )
 
     def on_stop_requested(self, signal_name: str) -> None:
@@ -74,6 +75,7 @@ class TrainingDisplay(TrainingObserver):
         self._console.print(
             f"{signal_name}: finishing this iteration, then saving. Once more to stop at once.",
             highlight=False,
+            soft_wrap=True,
         )
 
     def on_end(self, reason: str) -> None:

@@ -1,9 +1,11 @@
-"""What a run folder says about its run, and finding checkpoints in such folders."""
+"""Making run folders, what they say about their run, and finding checkpoints in them."""
 
 from __future__ import annotations
 
 import json
 import re
+import shutil
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,52 @@ from mjlab.scripts.cli import UserError, tell
 
 _INFO_FILE = "run.json"
 _CHECKPOINT = re.compile(r"model_(\d+)\.pt")
+
+
+class NewRunFolder:
+    """A context in which a run gets a folder of its own: `<experiment>/<time>[_<run name>]`.
+
+    A run that never begins leaves no folder behind: at the end of the context it is removed with
+    all that is in it, unless `keep` was called.
+    """
+
+    def __init__(self, experiment: Path, run_name: str) -> None:
+        self._experiment = experiment
+        self._run_name = run_name
+        self._kept = False
+        self.path = experiment
+        """The folder; it is there once the context is entered."""
+
+    def keep(self) -> None:
+        """Leave the folder where it is: the run has begun."""
+        self._kept = True
+
+    def __enter__(self) -> NewRunFolder:
+        """Make the folder.
+
+        Raises:
+            RunFolderError: it cannot be made or written to.
+        """
+        from mjlab.rl.checkpoint import ensure_writable_folder
+
+        ensure_writable_folder(self._experiment)
+        name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+        if self._run_name:
+            name += f"_{self._run_name}"
+        self.path, number = self._experiment / name, 2
+        while True:
+            # Making the folder is what claims it: another run may start in the same second.
+            try:
+                self.path.mkdir(parents=True)
+            except FileExistsError:
+                self.path, number = self._experiment / f"{name}-{number}", number + 1
+            else:
+                return self
+
+    def __exit__(self, *exception: object) -> None:
+        # A checkpoint is worth more than tidiness, whoever wrote it.
+        if not self._kept and not checkpoints_in(self.path):
+            shutil.rmtree(self.path, ignore_errors=True)
 
 
 def write_run_info(run_dir: Path, **info: Any) -> None:
@@ -36,10 +84,19 @@ def read_run_info(run_dir: Path) -> dict[str, Any]:
 
 def read_agent_params(run_dir: Path) -> dict[str, Any]:
     """Return the learner's config that a run was made with; empty if the folder does not say."""
+    return _read_params(run_dir / "params" / "agent.yaml")
+
+
+def read_env_params(run_dir: Path) -> dict[str, Any]:
+    """Return the environment's config of a run, likewise."""
+    return _read_params(run_dir / "params" / "env.yaml")
+
+
+def _read_params(path: Path) -> dict[str, Any]:
     import yaml
 
     try:
-        params = yaml.safe_load((run_dir / "params" / "agent.yaml").read_text())
+        params = yaml.safe_load(path.read_text())
     except (OSError, ValueError, yaml.YAMLError):
         return {}
     return params if isinstance(params, dict) else {}
@@ -57,7 +114,7 @@ def _number(checkpoint: Path) -> int:
 
 def newest_checkpoint(experiment: Path, task: str) -> Path | None:
     """Return the last checkpoint of the newest run of `task` that has one."""
-    for run_dir in _runs(experiment):
+    for run_dir in run_folders(experiment):
         # Runs that do not name their task were made by other tools, and may be of this one.
         if read_run_info(run_dir).get("task", task) == task:
             checkpoints = checkpoints_in(run_dir)
@@ -90,7 +147,7 @@ def named_checkpoint(path: Path, task: str) -> Path:
     raise UserError(_missing(path, task))
 
 
-def _runs(experiment: Path) -> list[Path]:
+def run_folders(experiment: Path) -> list[Path]:
     """Return the run folders of an experiment, newest first (their names begin with the time)."""
     if not experiment.is_dir():
         return []
@@ -98,7 +155,7 @@ def _runs(experiment: Path) -> list[Path]:
 
 
 def _missing(path: Path, task: str) -> str:
-    folders = [path.parent, *_runs(path.parent)[:1]]
+    folders = [path.parent, *run_folders(path.parent)[:1]]
     there = [str(file) for folder in folders for file in checkpoints_in(folder)[-3:]]
     hint = f" There are: {', '.join(there)}." if there else f" `train {task}` makes some."
     return f"There is no checkpoint {path}.{hint}"

@@ -6,14 +6,19 @@ import contextlib
 import logging
 import sys
 from dataclasses import asdict, dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import RslRlBaseRunnerCfg
+from mjlab.rl.progress import TrainingObserver
 from mjlab.scripts.cli import UserError, resolve_device
-from mjlab.scripts.run_folder import write_run_info
+from mjlab.scripts.resume import (
+    checkpoint_to_resume,
+    is_finished,
+    keep_number_of_environments,
+)
+from mjlab.scripts.run_folder import NewRunFolder, write_run_info
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 
 if TYPE_CHECKING:
@@ -23,6 +28,7 @@ logger = logging.getLogger(__name__)
 
 _AGENT_COUNTS = ("num_steps_per_env", "max_iterations", "save_interval")
 _ALGORITHM_COUNTS = ("num_learning_epochs", "num_mini_batches")
+_SEPARATORS = ("/", "\\")
 
 
 @dataclass
@@ -67,31 +73,39 @@ class TrainConfig:
 def launch_training(task: str, cfg: TrainConfig) -> Path:
     """Train `task` as `cfg` says; return the run's folder.
 
+    Nothing is trained where the run to resume has all its iterations; that run's folder is then
+    returned. A run that fails before its first iteration leaves no folder.
+
     Raises:
         UserError, ValueError, OSError, CheckpointError, EngineUnavailableError: what was asked for
             cannot be done; raised before training starts wherever that can be known.
     """
     _check_numbers(cfg)
+    _check_names(cfg)
     device = _device(cfg)
     _apply_short_forms(cfg)
-    checkpoint = _checkpoint_to_resume(cfg)
-    # Everything that can be wrong with the task is found before a folder is made for it.
-    run_dir = _run_dir(cfg)
-    env = _build_env(cfg, device, run_dir)
-    print(f"Task:    {task}, {env.num_envs} environments")
-    print(f"Physics: {env.unwrapped.sim.capabilities.description}")
-    print(f"Run:     {run_dir}", flush=True)
-    try:
-        _write_params(task, cfg, run_dir)
-        runner = _build_runner(task, cfg, env, run_dir, device)
-        if checkpoint is not None:
-            runner.load(str(checkpoint))
-            print(f"Resumed: {checkpoint}, iteration {runner.current_learning_iteration}")
-        _learn(task, cfg, runner, run_dir)
-    finally:
-        env.close()
-    _leave_results(task, cfg, run_dir, device)
-    return run_dir
+    checkpoint = checkpoint_to_resume(task, cfg)
+    if checkpoint is not None:
+        keep_number_of_environments(task, cfg, checkpoint)
+    experiment = Path(cfg.log_root).resolve() / cfg.agent.experiment_name
+    with NewRunFolder(experiment, cfg.agent.run_name) as folder:
+        env = _build_env(cfg, device, folder.path)
+        try:
+            print(f"Task:    {task}, {env.num_envs} environments")
+            print(f"Physics: {env.unwrapped.sim.capabilities.description}", flush=True)
+            runner = _build_runner(task, cfg, env, folder.path, device)
+            if checkpoint is not None:
+                runner.load(str(checkpoint))
+                if is_finished(cfg, runner, checkpoint):
+                    return checkpoint.parent
+                print(f"Resumed: {checkpoint}, iteration {runner.current_learning_iteration}")
+            print(f"Run:     {folder.path}", flush=True)
+            _write_params(task, cfg, folder.path)
+            _learn(task, cfg, runner, folder)
+        finally:
+            env.close()
+    _leave_results(task, cfg, folder.path, device)
+    return folder.path
 
 
 run_train = launch_training
@@ -108,6 +122,21 @@ def _check_numbers(cfg: TrainConfig) -> None:
     for flag, value in counts.items():
         if value < 1:
             raise UserError(f"{flag.replace('_', '-')} is {value}; it has to be at least 1.")
+
+
+def _check_names(cfg: TrainConfig) -> None:
+    """Refuse names that would put the run's folder elsewhere than below that of all runs."""
+    run_name, experiment = cfg.agent.run_name, cfg.agent.experiment_name
+    if any(separator in run_name for separator in _SEPARATORS):
+        raise UserError(
+            f"--agent.run-name is {run_name!r}; it is part of one folder's name and may not hold "
+            "a path separator. Runs are grouped by --agent.experiment-name."
+        )
+    if Path(experiment).is_absolute() or ".." in experiment.replace("\\", "/").split("/"):
+        raise UserError(
+            f"--agent.experiment-name is {experiment!r}; it names a folder within --log-root, so "
+            "it may be neither absolute nor contain '..'. Choose another place with --log-root."
+        )
 
 
 def _device(cfg: TrainConfig) -> str:
@@ -137,56 +166,13 @@ def _apply_short_forms(cfg: TrainConfig) -> None:
     cfg.env.seed = cfg.agent.seed
 
 
-def _checkpoint_to_resume(cfg: TrainConfig) -> Path | None:
-    if not cfg.agent.resume:
-        return None
-    from mjlab.utils.os import get_checkpoint_path, get_wandb_checkpoint_path
-
-    experiment = Path(cfg.log_root).resolve() / cfg.agent.experiment_name
-    if cfg.wandb_run_path is not None:
-        path, _ = get_wandb_checkpoint_path(
-            experiment, Path(cfg.wandb_run_path), cfg.wandb_checkpoint_name
-        )
-        return path
-    return get_checkpoint_path(experiment, cfg.agent.load_run, cfg.agent.load_checkpoint)
-
-
-def _run_dir(cfg: TrainConfig) -> Path:
-    """Return the run's folder, which is new and writable.
-
-    Raises:
-        RunFolderError: it cannot be made or written to.
-    """
-    from mjlab.rl.checkpoint import ensure_writable_folder
-
-    name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    if cfg.agent.run_name:
-        name += f"_{cfg.agent.run_name}"
-    experiment = Path(cfg.log_root).resolve() / cfg.agent.experiment_name
-    ensure_writable_folder(experiment)
-    candidate, number = experiment / name, 2
-    while True:
-        # Making the folder is what claims it: another run may start in the same second.
-        try:
-            candidate.mkdir(parents=True)
-        except FileExistsError:
-            candidate, number = experiment / f"{name}-{number}", number + 1
-        else:
-            return candidate
-
-
 def _build_env(cfg: TrainConfig, device: str, run_dir: Path) -> Any:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.rl import RslRlVecEnvWrapper
 
-    try:
-        env: Any = ManagerBasedRlEnv(
-            cfg.env, device=device, render_mode="rgb_array" if cfg.video else None
-        )
-    except BaseException:
-        # A run that never began leaves no empty folder behind.
-        run_dir.rmdir()
-        raise
+    env: Any = ManagerBasedRlEnv(
+        cfg.env, device=device, render_mode="rgb_array" if cfg.video else None
+    )
     if cfg.video:
         from mjlab.utils.wrappers import VideoRecorder
 
@@ -225,18 +211,32 @@ def _build_runner(
     return runner_cls(env, asdict(cfg.agent), str(run_dir), device)
 
 
-def _learn(task: str, cfg: TrainConfig, runner: MjlabOnPolicyRunner, run_dir: Path) -> None:
+class _Beginning(TrainingObserver):
+    """Keeps the run's folder once there is a run."""
+
+    def __init__(self, folder: NewRunFolder) -> None:
+        self._folder = folder
+
+    def on_start(self, first_iteration: int, total_iterations: int) -> None:
+        self._folder.keep()
+
+
+def _learn(task: str, cfg: TrainConfig, runner: MjlabOnPolicyRunner, folder: NewRunFolder) -> None:
     from mjlab.scripts.display import TrainingDisplay
 
-    runner.observers.append(TrainingDisplay(task))
+    runner.observers += [_Beginning(folder), TrainingDisplay(task)]
     try:
         runner.learn(cfg.agent.max_iterations, init_at_random_ep_len=True)
+        # A task's own runner may have its own loop, which need not tell that it starts.
+        folder.keep()
     finally:
         # On a full disk, what the folder says about its end is not worth hiding the error that
         # says which checkpoint is intact.
         with contextlib.suppress(OSError):
             write_run_info(
-                run_dir, ended=runner.stop_reason, iterations=runner.current_learning_iteration
+                folder.path,
+                ended=runner.stop_reason,
+                iterations=runner.current_learning_iteration,
             )
 
 

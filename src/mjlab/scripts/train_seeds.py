@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+import re
+import signal
 import subprocess
 import sys
+from pathlib import Path
+from types import FrameType
 
 from mjlab.scripts.cli import UserError, run_command, task_and_flags, task_usage
+from mjlab.scripts.run_folder import read_run_info, run_folders
 
+# Signals that end this process, and what the training process gets for each: it handles the first
+# two by saving, while SIGHUP (the terminal was closed) would lose what was learned.
+_FORWARDED: dict[int, signal.Signals] = {
+    signal.SIGINT: signal.SIGINT,
+    signal.SIGTERM: signal.SIGTERM,
+    signal.SIGHUP: signal.SIGTERM,
+}
+_SEEDS_HELP = "--seeds N    Train with the seeds 1, 2, ..., N, one after the other (default: 5)."
 _USAGE = task_usage(
     "train-seeds",
     "Train a task once for each seed 1, 2, ..., N (5 unless --seeds says otherwise), one run after "
@@ -21,6 +34,9 @@ _USAGE = task_usage(
 def _command(argv: list[str]) -> None:
     task, flags = task_and_flags(argv, _USAGE)
     count, flags = _take_count(flags)
+    if "-h" in flags or "--help" in flags:
+        print(f"{_SEEDS_HELP}\nAll other flags are those of `train`:\n", flush=True)
+    experiment = _experiment(task, flags)
     for seed in range(1, count + 1):
         print(f"\nSeed {seed} of {count}", flush=True)
         # Curves that are to be averaged have to be of one length, so no run stops early; flags
@@ -28,19 +44,83 @@ def _command(argv: list[str]) -> None:
         command = [sys.executable, "-m", "mjlab.scripts.train", task]
         command += ["--agent.evaluation.solved-return", "None"]
         command += [*flags, "--agent.seed", str(seed), "--agent.run-name", f"seed_{seed}"]
-        status = subprocess.run(command, check=False).returncode
+        before = set(run_folders(experiment))
+        status, stopped = run_forwarding_signals(command)
+        # A signal that went to the training process alone ends it with 0 as well.
+        if stopped or (status == 0 and _interrupted(experiment, before, seed)):
+            print(f"Stopped during seed {seed} of {count}; no other seed is trained.")
+            return
         if status != 0:
             raise UserError(f"Training with seed {seed} ended with status {status}.")
 
 
 def _take_count(flags: list[str]) -> tuple[int, list[str]]:
-    if "--seeds" not in flags:
-        return 5, flags
-    position = flags.index("--seeds")
-    value = flags[position + 1] if position + 1 < len(flags) else ""
-    if not value.isdigit() or int(value) < 1:
-        raise UserError(f"--seeds is {value!r}; give the number of seeds, such as --seeds 5.")
-    return int(value), flags[:position] + flags[position + 2 :]
+    """Take `--seeds N` or `--seeds=N` out of `flags`; return N, 5 without it, and the rest."""
+    for position, flag in enumerate(flags):
+        name, equals, value = flag.partition("=")
+        if name == "--seeds":
+            end = position + 1
+            if not equals:
+                value = flags[end] if end < len(flags) else ""
+                end += 1
+            if not value.isdigit() or int(value) < 1:
+                raise UserError(
+                    f"--seeds is {value!r}; give the number of seeds, such as --seeds 5."
+                )
+            return int(value), flags[:position] + flags[end:]
+    return 5, flags
+
+
+def _experiment(task: str, flags: list[str]) -> Path:
+    """Return the folder that the runs go to. Mistaken flags end the command here, `--help` too."""
+    from mjlab.scripts.cli import parse_flags
+    from mjlab.scripts.train_run import TrainConfig
+
+    cfg = parse_flags(TrainConfig, TrainConfig.from_task(task), flags, prog=f"train-seeds {task}")
+    return Path(cfg.log_root).resolve() / cfg.agent.experiment_name
+
+
+def _interrupted(experiment: Path, before: set[Path], seed: int) -> bool:
+    """Return whether the run of `seed`, which is not one of the folders `before`, was stopped."""
+    name = re.compile(rf".*_seed_{seed}(-\d+)?")
+    new = (run for run in run_folders(experiment) if run not in before and name.fullmatch(run.name))
+    return any(read_run_info(run).get("ended") == "interrupted" for run in new)
+
+
+def run_forwarding_signals(command: list[str]) -> tuple[int, bool]:
+    """Run `command` to its end; return its status, and whether this process was told to stop.
+
+    SIGINT, SIGTERM and SIGHUP do not end this process: each goes on to `command`, once, and what
+    it then does, such as saving, is waited for.
+    """
+    child: subprocess.Popen[bytes] | None = None
+    early: list[int] = []
+    stopped = False
+
+    def forward(number: int, frame: FrameType | None = None) -> None:
+        nonlocal stopped
+        stopped = True
+        if child is None:
+            early.append(number)
+        else:
+            child.send_signal(_FORWARDED[number])
+
+    # What is ignored, as SIGHUP under nohup, stays ignored.
+    handlers = {number: signal.getsignal(number) for number in _FORWARDED}
+    handlers = {number: old for number, old in handlers.items() if old != signal.SIG_IGN}
+    for number in handlers:
+        signal.signal(number, forward)
+    try:
+        # A session of its own, because a terminal sends Ctrl-C to all processes of its session,
+        # and a second signal tells training to stop at once.
+        child = subprocess.Popen(command, start_new_session=True)
+        for number in early:
+            forward(number)
+        return child.wait(), stopped
+    finally:
+        for number, old in handlers.items():
+            # A handler that was not set from Python reads as None and cannot be set again.
+            signal.signal(number, old if old is not None else signal.SIG_DFL)
 
 
 def main() -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import difflib
+import functools
 import importlib
 import inspect
 import logging
@@ -34,6 +35,10 @@ class UnknownTaskError(KeyError):
 
     def __str__(self) -> str:
         return str(self.args[0])
+
+
+class TaskImportError(RuntimeError):
+    """Raised for a task whose config or runner, given by name, cannot be imported."""
 
 
 @dataclass(frozen=True)
@@ -83,24 +88,29 @@ def list_tasks() -> list[str]:
 
 
 def load_env_cfg(task_name: str, play: bool = False) -> ManagerBasedRlEnvCfg:
-    """Return a copy of the environment config of a task, to train or to `play` with."""
+    """Return a copy of the environment config of a task, to train or to `play` with.
+
+    Raises:
+        UnknownTaskError: no such task.
+        TaskImportError: the config's function is given by name and cannot be imported.
+    """
     task = _find(task_name)
     if not play:
-        return _made(task.env_cfg)
+        return _made(task_name, task.env_cfg)
     if task.play_env_cfg is not None:
-        return _made(task.play_env_cfg)
-    return _made(task.env_cfg, play=True)
+        return _made(task_name, task.play_env_cfg)
+    return _made(task_name, task.env_cfg, play=True)
 
 
 def load_rl_cfg(task_name: str) -> RslRlBaseRunnerCfg:
-    """Return a copy of the learner's config of a task."""
-    return _made(_find(task_name).rl_cfg)
+    """Return a copy of the learner's config of a task; raises as `load_env_cfg` does."""
+    return _made(task_name, _find(task_name).rl_cfg)
 
 
 def load_runner_cls(task_name: str) -> type | None:
-    """Return the runner class of a task, or None for the default one."""
+    """Return the runner class of a task, or None for the default one; raises likewise."""
     runner_cls = _find(task_name).runner_cls
-    return _imported(runner_cls) if isinstance(runner_cls, str) else runner_cls
+    return _imported(task_name, runner_cls) if isinstance(runner_cls, str) else runner_cls
 
 
 def require_task(task_name: str) -> None:
@@ -119,10 +129,10 @@ def _find(task_name: str) -> _Task:
     return _tasks[task_name]
 
 
-def _made(source: Any, **kwargs: Any) -> Any:
+def _made(task_name: str, source: Any, **kwargs: Any) -> Any:
     """Return a fresh config from a config, a function, or a function's name."""
     if isinstance(source, str):
-        source = _imported(source)
+        source = _imported(task_name, source)
     if callable(source):
         taken = inspect.signature(source).parameters
         kwargs = {name: value for name, value in kwargs.items() if name in taken}
@@ -130,9 +140,17 @@ def _made(source: Any, **kwargs: Any) -> Any:
     return copy.deepcopy(source(**kwargs) if callable(source) else source)
 
 
-def _imported(name: str) -> Any:
+def _imported(task_name: str, name: str) -> Any:
+    """Return what `module:attribute` names; raise TaskImportError if that fails."""
     module, _, attribute = name.partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    # The module is not ours, and may fail in any way there is.
+    except (Exception, SystemExit) as error:
+        raise TaskImportError(
+            f"Task {task_name!r} cannot be used, because importing {name!r}, which it was "
+            f"registered with, failed: {type(error).__name__}: {error}"
+        ) from error
 
 
 def _discover() -> None:
@@ -145,16 +163,25 @@ def _discover() -> None:
 
     for module in pkgutil.iter_modules(mjlab.tasks.__path__, "mjlab.tasks."):
         if module.ispkg:
-            importlib.import_module(module.name)
+            load = functools.partial(importlib.import_module, module.name)
+            _register_all(f"the package {module.name!r}", load)
     for entry_point in entry_points(group=ENTRY_POINT_GROUP):
-        try:
-            entry_point.load()
-        # A broken package must not take the others down with it, not even one that exits.
-        except (Exception, SystemExit):
-            logger.error(
-                "Tasks of the package behind entry point %r (%s) are skipped, because it fails to "
-                "import:\n%s",
-                entry_point.name,
-                entry_point.value,
-                traceback.format_exc().rstrip(),
-            )
+        source = f"the package behind entry point {entry_point.name!r} ({entry_point.value})"
+        _register_all(source, entry_point.load)
+
+
+def _register_all(source: str, load: Callable[[], object]) -> None:
+    """Call `load`, which registers tasks: all those of `source`, or none if it fails."""
+    before = dict(_tasks)
+    try:
+        load()
+    # A broken package must not take the others down with it, not even one that exits.
+    except (Exception, SystemExit):
+        # What it registered before it failed may need what it would have done after.
+        _tasks.clear()
+        _tasks.update(before)
+        logger.error(
+            "Tasks of %s are skipped, because it fails to import:\n%s",
+            source,
+            traceback.format_exc().rstrip(),
+        )

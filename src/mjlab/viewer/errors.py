@@ -5,9 +5,12 @@ from __future__ import annotations
 import os
 
 _INSTALL_HINT = (
-    "To render without a display, install libegl1 (`apt-get install libegl1`), or install "
-    "libosmesa6 (`apt-get install libosmesa6`) and set MUJOCO_GL=osmesa."
+    "To render without a display, install an EGL library and a driver "
+    "(`apt-get install libegl1 libgl1 libgl1-mesa-dri`), or install libosmesa6 "
+    "(`apt-get install libosmesa6`) and set MUJOCO_GL=osmesa."
 )
+# How PyOpenGL fails where there is no EGL: it looks for the function in a library that is None.
+_NO_EGL = "object has no attribute 'eglQueryString'"
 
 
 class RenderingUnavailableError(RuntimeError):
@@ -22,4 +25,6 @@ class RenderingUnavailableError(RuntimeError):
         """The error for an OpenGL context that could not be made, whatever the library said."""
         backend = os.environ.get("MUJOCO_GL") or "unset"
         reason = " ".join(str(cause).split()) or type(cause).__name__
-        return cls(f"Cannot render offscreen (MUJOCO_GL={backend}): {reason}. {_INSTALL_HINT}")
+        if _NO_EGL in reason:
+            reason = "no EGL library or driver was found"
+        return cls(f"Cannot render offscreen (MUJOCO_GL={backend}): {reason.rstrip('.')}. {_INSTALL_HINT}")

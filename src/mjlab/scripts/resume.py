@@ -1,0 +1,127 @@
+"""Which run `--agent.resume True` goes on from, and whether and how it does."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mjlab.scripts.cli import UserError, tell
+from mjlab.scripts.run_folder import read_env_params, read_run_info, run_folders
+from mjlab.tasks.registry import load_env_cfg
+
+if TYPE_CHECKING:
+    from mjlab.rl import MjlabOnPolicyRunner
+    from mjlab.scripts.train_run import TrainConfig
+
+
+def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
+    """Return the checkpoint that `cfg` asks to go on from, or None if it asks for a new run.
+
+    It is the newest one of the newest run of `task` that the patterns let through. Runs that do
+    not name their task count as runs of any task.
+
+    Raises:
+        UserError: the run asked for is of another task, or a pattern is no regular expression.
+        ValueError: there is no such run or checkpoint; the message says what there is.
+    """
+    if not cfg.agent.resume:
+        return None
+    from mjlab.utils.os import get_checkpoint_path, get_wandb_checkpoint_path
+
+    agent = cfg.agent
+    experiment = Path(cfg.log_root).resolve() / agent.experiment_name
+    if cfg.wandb_run_path is not None:
+        run_path = Path(cfg.wandb_run_path)
+        return get_wandb_checkpoint_path(experiment, run_path, cfg.wandb_checkpoint_name)[0]
+    for flag in ("load_run", "load_checkpoint"):
+        _check_pattern(f"--agent.{flag.replace('_', '-')}", getattr(agent, flag))
+    pattern = agent.load_run
+    matching = _matching(experiment, pattern)
+    others = {run.name: found for run in matching if (found := _task_of(run, task)) != task}
+    if others:
+        if len(others) == len(matching):
+            raise UserError(_only_other_tasks(task, agent.load_run, experiment, others))
+        own = (re.escape(run.name) for run in matching if run.name not in others)
+        pattern = "|".join(own)
+    return get_checkpoint_path(experiment, pattern, agent.load_checkpoint)
+
+
+def keep_number_of_environments(task: str, cfg: TrainConfig, checkpoint: Path) -> None:
+    """Go on with as many environments as the resumed run had, unless the flags give a number.
+
+    With fewer of them, a policy that took hours is spoilt within a few iterations.
+
+    Raises:
+        CheckpointError: the checkpoint cannot be read.
+    """
+    scene = cfg.env.scene
+    if cfg.num_envs is not None or scene.num_envs != load_env_cfg(task).scene.num_envs:
+        return
+    count = _saved_num_envs(checkpoint)
+    if count is None:
+        tell(
+            f"{checkpoint} does not say how many environments its run had; the task's "
+            f"{scene.num_envs} are used. --num-envs gives another number."
+        )
+        return
+    scene.num_envs = count
+    print(f"Resuming with {count} environments, as before; --num-envs gives another number.")
+
+
+def is_finished(cfg: TrainConfig, runner: MjlabOnPolicyRunner, checkpoint: Path) -> bool:
+    """Return whether the loaded run has all its iterations already, and say so if it has."""
+    done, total = runner.current_learning_iteration, cfg.agent.max_iterations
+    if done < total:
+        return False
+    print(
+        f"Nothing to train: {checkpoint} has finished {done} iterations, and "
+        f"--agent.max-iterations, which counts them in, is {total}. Raise it to train on "
+        f"(--agent.max-iterations {done + 100}, say)."
+    )
+    return True
+
+
+def _saved_num_envs(checkpoint: Path) -> int | None:
+    """Return how many environments the run of `checkpoint` had; None if nothing says so."""
+    from mjlab.rl.checkpoint import load_checkpoint
+
+    # Runs of other tools keep no such state, but may have written down their config.
+    for holder in (
+        load_checkpoint(checkpoint).get("training_state"),
+        read_env_params(checkpoint.parent).get("scene"),
+    ):
+        count: Any = holder.get("num_envs") if isinstance(holder, dict) else None
+        if isinstance(count, int) and count >= 1:
+            return count
+    return None
+
+
+def _check_pattern(flag: str, pattern: str) -> None:
+    try:
+        re.compile(pattern)
+    except re.error as error:
+        raise UserError(f"{flag} is {pattern!r}, which is no regular expression: {error}.") from (
+            error
+        )
+
+
+def _matching(experiment: Path, pattern: str) -> list[Path]:
+    """Return the runs that `pattern` means, by the rule of `get_checkpoint_path`."""
+    runs = run_folders(experiment)
+    exact = [run for run in runs if re.fullmatch(pattern, run.name)]
+    return exact or [run for run in runs if re.match(pattern, run.name)]
+
+
+def _task_of(run_dir: Path, default: str) -> str:
+    return str(read_run_info(run_dir).get("task", default))
+
+
+def _only_other_tasks(task: str, pattern: str, experiment: Path, others: dict[str, str]) -> str:
+    runs = [f"{name} is of {found}" for name, found in list(others.items())[:3]]
+    more = f", and {len(others) - 3} more" if len(others) > 3 else ""
+    asked = "" if pattern == ".*" else f" that matches --agent.load-run {pattern!r}"
+    return (
+        f"There is no run of {task} in {experiment}{asked}: {', '.join(runs)}{more}. Resume a run "
+        "with the task that it was trained on."
+    )
