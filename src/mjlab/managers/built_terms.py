@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
+from mjlab.managers.error_labels import errors_named
 from mjlab.managers.manager_base import ManagerBase
 
 if TYPE_CHECKING:
@@ -51,7 +52,8 @@ class BuiltTermsManager(ManagerBase, Generic[TermT]):
 
     def _prepare_terms(self) -> None:
         for name, term_cfg in self._enabled(self.cfg, self._cfg_type):
-            term = term_cfg.build(self._env)
+            with errors_named(self._label(name)):
+                term = term_cfg.build(self._env)
             if not isinstance(term, self._term_type):
                 raise TypeError(
                     f"{self._label(name)}: {type(term_cfg).__name__}.build must return an "

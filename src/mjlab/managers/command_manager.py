@@ -13,6 +13,7 @@ import torch
 from mjlab.managers.built_terms import BuiltTermsManager
 from mjlab.managers.debug_vis import DebugVisSwitches
 from mjlab.managers.env_ids import as_ids, is_empty
+from mjlab.managers.finite_mean import finite_mean
 from mjlab.managers.manager_base import ManagerTermBase
 from mjlab.managers.null_managers import NullCommandManager as NullCommandManager
 
@@ -95,13 +96,16 @@ class CommandTerm(ManagerTermBase):
         self._update_command(env_ids)
 
     def reset(self, env_ids: torch.Tensor | slice | None) -> dict[str, float]:
-        """Draw new commands in these environments, and return and zero the mean of each metric."""
+        """Draw new commands in these environments, and return and zero the mean of each metric.
+
+        Environments where a metric is NaN or infinite are left out of its mean.
+        """
         ids = as_ids(env_ids, self.num_envs, self.device)
         if is_empty(ids):
             return {}
         log: dict[str, float] = {}
         if self.metrics:
-            means = torch.stack([values[ids].float().mean() for values in self.metrics.values()])
+            means = torch.stack([finite_mean(v[ids].float()) for v in self.metrics.values()])
             log = dict(zip(self.metrics, means.tolist(), strict=True))
             for values in self.metrics.values():
                 values[ids] = 0.0

@@ -35,10 +35,15 @@ class CurriculumManager(TermListManager):
         self._state: dict[str, Any] = dict.fromkeys(self._term_names)
 
     def compute(self, env_ids: torch.Tensor | slice | None = None) -> None:
-        """Call all terms for the environments that are about to reset, and keep their results."""
+        """Call all terms for the environments that are about to reset, and keep their results.
+
+        Raises `ValueError` if a term returns a tensor that has not exactly one element.
+        """
         index = as_index(env_ids)
         for name, cfg in zip(self._term_names, self._term_cfgs, strict=True):
-            self._state[name] = cfg.func(self._env, index, **cfg.params)
+            state = cfg.func(self._env, index, **cfg.params)
+            self._check_state(name, state)
+            self._state[name] = state
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, float]:
         """Return `Curriculum/<term>` or `Curriculum/<term>/<key>`, and reset the terms."""
@@ -63,6 +68,17 @@ class CurriculumManager(TermListManager):
             values = list(state.values()) if isinstance(state, dict) else [state]
             terms.append((name, [float(_number(v)) for v in values if v is not None]))
         return terms
+
+    def _check_state(self, name: str, state: Any) -> None:
+        items = state.items() if isinstance(state, dict) else [(None, state)]
+        for key, value in items:
+            if isinstance(value, torch.Tensor) and value.numel() != 1:
+                where = "" if key is None else f", key {key!r}"
+                raise ValueError(
+                    f"{self._label(name)}{where}: returned a tensor of shape {tuple(value.shape)}, "
+                    "but what is logged must be one number. Reduce it (mean, max) in the term, or "
+                    "return a dict of numbers."
+                )
 
 
 def _number(value: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import torch
@@ -40,7 +41,8 @@ class EventTermCfg(ManagerTermBaseCfg):
     """When it happens: once at "startup", at each "reset", at an "interval", or every "step"."""
 
     interval_range_s: tuple[float, float] | None = None
-    """Shortest and longest time between two events of mode "interval", in seconds."""
+    """Shortest and longest time between two events of mode "interval", in seconds, neither
+    negative."""
 
     is_global_time: bool = False
     """Mode "interval": True has one timer for all environments, which resets do not touch."""
@@ -180,13 +182,18 @@ class EventManager(TermFunctionSwitches, TermListManager):
             self._last_reset_step[name] = torch.full(
                 (self.num_envs,), _NEVER, dtype=torch.long, device=self.device
             )
+        bounds = cfg.interval_range_s
+        if bounds is not None and not _is_range(bounds):
+            raise ValueError(
+                f"{self._label(name)}: interval_range_s is {bounds!r}, but must be (shortest, "
+                "longest) in seconds, with 0 <= shortest <= longest."
+            )
         if cfg.mode != "interval":
             return
-        bounds = cfg.interval_range_s
-        if bounds is None or bounds[0] > bounds[1]:
+        if bounds is None:
             raise ValueError(
                 f"{self._label(name)}: mode 'interval' needs interval_range_s=(shortest, longest) "
-                f"in seconds, got {bounds!r}."
+                "in seconds."
             )
         self._timers[name] = (
             self._draw(cfg, 1).item() if cfg.is_global_time else self._draw(cfg, self.num_envs)
@@ -200,6 +207,11 @@ class EventManager(TermFunctionSwitches, TermListManager):
         terms = zip(self._term_names, self._term_cfgs, strict=True)
         rows = [(cfg.mode, name, cfg.interval_range_s or "") for name, cfg in terms]
         return ["mode", "name", "interval (s)"], rows
+
+
+def _is_range(bounds: Any) -> bool:
+    is_pair = isinstance(bounds, tuple | list) and len(bounds) == 2
+    return is_pair and all(isinstance(b, Real) for b in bounds) and 0 <= bounds[0] <= bounds[1]
 
 
 def _check_arguments(

@@ -20,6 +20,7 @@ import torch
 
 from mjlab.managers.config_edits import changes, plain_values, write_changes
 from mjlab.managers.env_ids import EnvIds, as_index
+from mjlab.managers.error_labels import errors_named
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.table import format_table
 from mjlab.utils.state import stateful
@@ -184,7 +185,8 @@ class ManagerBase(ABC):
                 f"{self._label(name)}: func must be a function or a class, got {cfg.func!r}."
             )
         if inspect.isclass(cfg.func):
-            cfg.func = cfg.func(cfg=cfg, env=self._env)
+            with errors_named(self._label(name)):
+                cfg.func = cfg.func(cfg=cfg, env=self._env)
             if not callable(cfg.func):
                 raise TypeError(f"{self._label(name)}: {type(cfg.func).__name__} has no __call__.")
         self._check_parameters(name, cfg, leading)

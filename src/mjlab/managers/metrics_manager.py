@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from mjlab.managers.env_ids import as_index, is_empty
+from mjlab.managers.finite_mean import finite_mean
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
 from mjlab.managers.null_managers import NullMetricsManager as NullMetricsManager
 
@@ -86,8 +87,8 @@ class MetricsManager(TermListManager):
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, torch.Tensor]:
         """Return `Episode_Metrics/<term>`, the mean over these environments, and start anew.
 
-        Environments without a step have no maximum and are left out of its mean, which is 0 if
-        there is no other.
+        Environments without a step have no maximum and are left out of its mean, as are, for each
+        term, environments where it is NaN or infinite. The mean is 0 if none is left.
         """
         self._reset_class_terms(env_ids)
         if is_empty(env_ids) or not self._term_names:
@@ -115,16 +116,14 @@ class MetricsManager(TermListManager):
 
     def _episode_means(self, reduce: str, index: torch.Tensor | slice) -> torch.Tensor:
         """Return the mean over environments of every term (terms,), reduced in this way."""
-        steps = self._steps[index]
         if reduce == "mean":
-            return (self._sum[:, index] / steps.clamp(min=1.0)).mean(dim=1)
+            return finite_mean(self._sum[:, index] / self._steps[index].clamp(min=1.0))
         if reduce == "sum":
-            return self._sum[:, index].mean(dim=1)
+            return finite_mean(self._sum[:, index])
         if reduce == "last":
-            return self._last[:, index].mean(dim=1)
-        stepped = steps > 0.0
-        maxima = torch.where(stepped, self._max[:, index], 0.0)
-        return maxima.sum(dim=1) / stepped.sum().clamp(min=1)
+            return finite_mean(self._last[:, index])
+        # Without a step the maximum is minus infinity, which is left out.
+        return finite_mean(self._max[:, index])
 
     def _group_by_reduce(self) -> dict[str, list[int]]:
         groups: dict[str, list[int]] = {}

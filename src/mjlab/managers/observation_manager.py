@@ -11,6 +11,7 @@ import torch
 
 from mjlab.managers.env_ids import is_empty
 from mjlab.managers.manager_base import ManagerBase
+from mjlab.managers.observation_checks import check_noise
 from mjlab.managers.observation_group import ObservationGroup as ObservationGroup
 from mjlab.managers.observation_group import ObservationGroupCfg as ObservationGroupCfg
 from mjlab.managers.observation_group import check_group
@@ -155,6 +156,8 @@ class ObservationManager(ManagerBase):
         term_cfg: ObservationTermCfg,
     ) -> ObservationTerm:
         label = f"{group_name}/{term_name}"
+        # Also where there is no corruption, which would hide a mistake until someone turns it on.
+        check_noise(label, term_cfg.noise)
         if not group_cfg.enable_corruption:
             term_cfg.noise = None
         if group_cfg.history_length is not None:

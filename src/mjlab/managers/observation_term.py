@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.managers.error_labels import errors_named
 from mjlab.managers.manager_base import ManagerTermBaseCfg
 from mjlab.managers.nan_policy import NanPolicy, apply_nan_policy
+from mjlab.managers.observation_checks import check_clip, scale_tensor
 from mjlab.utils.buffers import CircularBuffer, DelayBuffer
 from mjlab.utils.noise import NoiseCfg, NoiseModelCfg
 from mjlab.utils.state import stateful
@@ -74,6 +75,9 @@ class ObservationTerm:
 
     The term's function is called once, to learn its shape.
 
+    Raises `ValueError`, naming the term, for a clip, scale, delay or history that makes no sense,
+    and puts the term's name in front of what its function raises.
+
     Attributes:
         shape: Shape of the result without the environment dimension.
     """
@@ -91,14 +95,15 @@ class ObservationTerm:
         self.cfg = cfg
         self._env = env
         self._nan_policy: NanPolicy = nan_policy
-        self._raw_shape: torch.Size | None = None
-        raw_shape = self._call().shape
-        self._raw_shape = raw_shape
-        self._scale_as_tensor()
-        self._noise_model = self._build_noise_model()
-        self._delay = self._build(self._build_delay)
-        self._history = self._build(self._build_history)
-        self.shape = self._result_shape(tuple(raw_shape[1:]))
+        self._raw_shape = self._first_shape()
+        check_clip(label, cfg.clip)
+        if cfg.scale is not None:
+            cfg.scale = scale_tensor(label, cfg.scale, self._raw_shape, env.device)
+        with errors_named(self._name):
+            self._noise_model = self._build_noise_model()
+            self._delay = self._build_delay()
+            self._history = self._build_history()
+        self.shape = self._result_shape(tuple(self._raw_shape[1:]))
 
     def compute(self, update_history: bool, env_ids: torch.Tensor | None) -> torch.Tensor:
         """Return the value (num_envs, *shape), which may be memory of the simulation.
@@ -142,7 +147,7 @@ class ObservationTerm:
 
     def _call(self) -> torch.Tensor:
         value = self.cfg.func(self._env, **self.cfg.params)
-        if self._raw_shape is None or not isinstance(value, torch.Tensor):
+        if not isinstance(value, torch.Tensor):
             self._check_first(value)
         elif value.shape != self._raw_shape:
             raise ValueError(
@@ -176,7 +181,7 @@ class ObservationTerm:
         """Keep the scale as a float tensor on the device, also after someone has replaced it."""
         scale = self.cfg.scale
         if scale is not None and not isinstance(scale, torch.Tensor):
-            scale = torch.tensor(scale, dtype=torch.float32, device=self._env.device)
+            scale = scale_tensor(self.label, scale, self._raw_shape, self._env.device)
             self.cfg.scale = scale
         return scale
 
@@ -205,11 +210,15 @@ class ObservationTerm:
 
     # Building.
 
-    def _build(self, builder: Callable[[], Any]) -> Any:
-        try:
-            return builder()
-        except ValueError as error:
-            raise ValueError(f"Observation term {self.label!r}: {error}") from error
+    @property
+    def _name(self) -> str:
+        return f"Observation term {self.label!r}"
+
+    def _first_shape(self) -> torch.Size:
+        with errors_named(self._name):
+            value = self.cfg.func(self._env, **self.cfg.params)
+        self._check_first(value)
+        return value.shape
 
     def _build_noise_model(self) -> Any:
         noise = self.cfg.noise

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from mjlab.managers.error_labels import errors_named
 from mjlab.managers.manager_base import ManagerTermBase, ManagerTermBaseCfg, TermListManager
 from mjlab.managers.null_managers import NullRecorderManager as NullRecorderManager
 
@@ -95,7 +96,8 @@ class RecorderManager(TermListManager):
                     f"{cfg.func!r}."
                 )
             self._resolve_params(name, cfg)
-            term = cfg.func(cfg, self._env)
+            with errors_named(self._label(name)):
+                term = cfg.func(cfg, self._env)
             cfg.func = term
             self._terms[name] = term
             self._term_names.append(name)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -32,6 +34,8 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         env: The environment.
         scale_by_dt: Whether rewards are multiplied by the duration of a step, so that weights are
             rates per second.
+
+    Raises `ValueError` if a weight is not a finite number.
     """
 
     _cfg_type = RewardTermCfg
@@ -98,6 +102,15 @@ class RewardManager(TermFunctionSwitches, TermListManager):
             for name, mean in zip(self._term_names, means, strict=True)
         }
 
+    def _prepare_terms(self) -> None:
+        for name, cfg in self.cfg.items():
+            if isinstance(cfg, RewardTermCfg) and not _is_number(cfg.weight):
+                raise ValueError(
+                    f"{self._label(name)}: weight is {cfg.weight!r}, but must be a finite number. "
+                    "To switch the term off, set the weight to 0 or the whole term to None."
+                )
+        super()._prepare_terms()
+
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
         """Return, for one environment, the weighted rate of each term in the last step."""
         rates = self._step_reward[env_idx].tolist()
@@ -106,3 +119,8 @@ class RewardManager(TermFunctionSwitches, TermListManager):
     def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
         terms = zip(self._term_names, self._term_cfgs, strict=True)
         return ["name", "weight"], [(name, cfg.weight) for name, cfg in terms]
+
+
+def _is_number(value: Any) -> bool:
+    # A weight that is NaN would silently turn the term off, because NaN rewards count as 0.
+    return isinstance(value, Real) and math.isfinite(value)

@@ -62,11 +62,11 @@ class SharedField(torch.Tensor):
     ) -> Any:
         target = args[0] if args else None
         if isinstance(target, SharedField) and _writes(func):
-            raise RuntimeError(
-                f"Model field {target.field_name!r} is shared by all environments and cannot be "
-                f"written. Call sim.expand_model_fields(({target.field_name!r},)) first, or declare "
-                f"it with @requires_model_fields({target.field_name!r})."
-            )
+            raise _refusal(target)
+        out = (kwargs or {}).get("out")
+        for tensor in out if isinstance(out, tuple | list) else (out,):
+            if isinstance(tensor, SharedField):
+                raise _refusal(tensor)
         with torch._C.DisableTorchFunctionSubclass():
             result = func(*args, **(kwargs or {}))
         # Views still alias the shared row, so they stay protected.
@@ -78,6 +78,15 @@ class SharedField(torch.Tensor):
             result = result.as_subclass(cls)
             result.field_name = target.field_name
         return result
+
+
+def _refusal(field: SharedField) -> RuntimeError:
+    name = field.field_name
+    return RuntimeError(
+        f"Model field {name!r} is shared by all environments and cannot be written. Call "
+        f"sim.expand_model_fields(({name!r},)) first, or declare it with "
+        f"@requires_model_fields({name!r})."
+    )
 
 
 def _writes(func: Any) -> bool:
