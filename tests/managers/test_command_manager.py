@@ -238,3 +238,24 @@ def test_viewer_hooks_reach_every_term(env):
         assert term.gui == (name, "server", 3, "change", "action")
         assert term.paused is True
         assert term.gui_reset is ids, "all terms are asked, also after one has answered"
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_metric_that_is_not_finite_in_one_environment_is_left_out_there(env, bad):
+    manager, term = make(env)
+    term.metrics["updates"][:] = torch.tensor([1.0, bad, 3.0, 100.0])
+    ids = torch.tensor([0, 1, 2])
+    assert manager.reset(ids) == {"Metrics/goal/updates": 2.0}
+    term.metrics["updates"][:] = bad
+    assert manager.reset(ids) == {"Metrics/goal/updates": 0.0}
+
+
+@dataclass(kw_only=True)
+class BrokenCfg(CountCfg):
+    def build(self, env):
+        raise KeyError("no such joint")
+
+
+def test_an_error_while_a_command_is_built_names_it(env):
+    with pytest.raises(KeyError, match="CommandManager term 'goal': no such joint"):
+        CommandManager({"goal": BrokenCfg(resampling_time_range=(1.0, 1.0))}, env)

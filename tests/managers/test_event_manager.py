@@ -141,7 +141,10 @@ def test_arguments_that_do_not_fit_are_refused(env, mode, arguments, message):
         manager.apply(mode, **arguments)
 
 
-@pytest.mark.parametrize("bounds", [None, (2.0, 1.0)])
+@pytest.mark.parametrize(
+    "bounds",
+    [None, (2.0, 1.0), (-1.0, 1.0), (-2.0, -1.0), (1.0,), 1.0, (float("nan"), 1.0), ("0", "1")],
+)
 def test_intervals_need_a_range(env, bounds):
     with pytest.raises(ValueError, match="'a'.*interval_range_s"):
         make(env, "interval", interval_range_s=bounds)

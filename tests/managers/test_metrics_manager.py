@@ -111,3 +111,21 @@ def test_step_terms_need_no_substeps_and_are_not_called_in_them(env):
     assert not manager.needs_substep
     manager.compute_substep()
     assert calls == []
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("reduce", REDUCE_OPTIONS)
+def test_an_environment_that_is_not_finite_is_left_out_of_the_mean(env, reduce, bad):
+    cfg = {
+        "bad": MetricsTermCfg(func=value, reduce=reduce),
+        "good": MetricsTermCfg(func=lambda env: torch.arange(4.0), reduce=reduce),
+    }
+    manager = MetricsManager(cfg, env)
+    env.value = torch.tensor([2.0, bad, 6.0, 4.0])
+    manager.compute()
+    log = manager.reset(torch.tensor([0, 1, 2]))
+    assert log["Episode_Metrics/bad"] == 4.0
+    assert log["Episode_Metrics/good"] == 1.0, "each term leaves out its own environments"
+    env.value = torch.full((4,), bad)
+    manager.compute()
+    assert manager.reset(torch.tensor([0, 1]))["Episode_Metrics/bad"] == 0.0

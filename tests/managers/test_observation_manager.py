@@ -451,3 +451,87 @@ def test_saved_state_continues_as_if_nothing_had_happened(env):
     wanted = manager.compute(update_history=True)["g"]
     torch.set_rng_state(rng)
     assert torch.equal(other.compute(update_history=True)["g"], wanted)
+
+
+# What is refused when a term is built.
+
+
+@pytest.mark.parametrize(
+    "scale",
+    [(1.0, 2.0, 3.0), torch.ones(3), torch.ones(1, 4, 2), (), "big", {"a": 1.0}, ((1.0,), (2.0,))],
+)
+def test_a_scale_that_does_not_fit_is_refused(env, scale):
+    with pytest.raises(ValueError, match="'g/t': scale"):
+        make(env, ObservationTermCfg(func=state, scale=scale))
+
+
+@pytest.mark.parametrize("scale", [2.0, (2.0,), (2.0, 2.0), torch.tensor(2.0), torch.full((2,), 2)])
+def test_a_scale_is_one_number_or_one_for_each_component(env, scale):
+    manager = make(env, ObservationTermCfg(func=state, scale=scale))
+    torch.testing.assert_close(manager.compute()["g"], 2.0 * env.state)
+
+
+def test_a_scale_that_is_replaced_later_is_checked_too(env):
+    manager = make(env)
+    manager.get_term_cfg("g", "t").scale = (1.0, 2.0, 3.0)
+    with pytest.raises(ValueError, match=r"'g/t': scale has shape \(3,\)"):
+        manager.compute(update_history=True)
+
+
+@pytest.mark.parametrize(
+    "clip", [(1.0, -1.0), (1.0,), (0.0, 1.0, 2.0), 1.0, (None, 1.0), "01", (float("nan"), 1.0)]
+)
+def test_a_clip_is_a_pair_in_order(env, clip):
+    with pytest.raises(ValueError, match=r"'g/t': clip is .*\(lowest, highest\)"):
+        make(env, ObservationTermCfg(func=state, clip=clip))
+
+
+def test_a_clip_may_be_open_on_one_side_or_a_point(env):
+    for clip in ((-float("inf"), 3.0), (3.0, float("inf")), (1, 1)):
+        obs = make(env, ObservationTermCfg(func=state, clip=clip)).compute()["g"]
+        torch.testing.assert_close(obs, env.state.clamp(*clip))
+
+
+@pytest.mark.parametrize("corruption", [False, True])
+@pytest.mark.parametrize("noise", [0.1, UniformNoiseCfg, (-0.1, 0.1)])
+def test_noise_is_the_config_of_a_noise(env, noise, corruption):
+    with pytest.raises(ValueError, match="'g/t': noise is .*UniformNoiseCfg"):
+        make(env, ObservationTermCfg(func=state, noise=noise), enable_corruption=corruption)
+
+
+class SpecialError(ValueError):
+    """Cannot be made from a message alone."""
+
+    def __init__(self, code, reason):
+        super().__init__(code, reason)
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "message"),
+    [
+        (ValueError("no contact"), ValueError, "'g/t': no contact"),
+        (KeyError("no robot"), KeyError, "'g/t': no robot"),
+        (SpecialError(3, "odd"), ValueError, r"'g/t': \(3, 'odd'\)"),
+    ],
+)
+def test_errors_of_the_first_call_and_of_the_constructor_name_the_term(env, error, kind, message):
+    def call(env):
+        raise error
+
+    class Term:
+        def __init__(self, cfg, env):
+            raise error
+
+    for func, label in ((call, "Observation term"), (Term, "ObservationManager term")):
+        with pytest.raises(kind, match=f"{label} {message}") as caught:
+            make(env, ObservationTermCfg(func=func))
+        assert type(caught.value) is kind
+        assert caught.value.__cause__ is error
+
+
+def test_errors_of_other_kinds_pass_unchanged(env):
+    def call(env):
+        raise ZeroDivisionError("as it was")
+
+    with pytest.raises(ZeroDivisionError, match="^as it was$"):
+        make(env, ObservationTermCfg(func=call))

@@ -63,3 +63,13 @@ def test_selections_are_resolved_before_the_recorder_is_built(env):
     params = {"asset_cfg": SceneEntityCfg("robot", joint_names="joint_b")}
     manager = RecorderManager({"a": RecorderTermCfg(func=Selecting, params=params)}, env)
     assert manager.get_term("a").ids == [1]
+
+
+class Broken(RecorderTerm):
+    def __init__(self, cfg, env):
+        raise ValueError("no folder")
+
+
+def test_an_error_while_a_recorder_is_built_names_it(env):
+    with pytest.raises(ValueError, match="RecorderManager term 'a': no folder"):
+        RecorderManager({"a": RecorderTermCfg(func=Broken)}, env)

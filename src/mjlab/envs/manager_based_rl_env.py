@@ -12,7 +12,7 @@ import torch
 
 from mjlab.envs import env_state
 from mjlab.envs.env_cfg import ManagerBasedRlEnvCfg as ManagerBasedRlEnvCfg
-from mjlab.envs.env_checks import check_env_cfg
+from mjlab.envs.env_checks import as_action, as_reset_ids, check_device, check_env_cfg
 from mjlab.managers import (
     ActionManager,
     CommandManager,
@@ -63,10 +63,12 @@ class ManagerBasedRlEnv:
         `render_mode` is None or `rgb_array`. Further keyword arguments are ignored.
 
         Raises:
-            ValueError: whatever is wrong with the config, by name, before any stepping.
+            ValueError: whatever is wrong with the config, by name, before any stepping; or the
+                device does not exist.
             EngineUnavailableError: the engine cannot serve the device, or cannot run here.
         """
         check_env_cfg(cfg)
+        check_device(device)
         # Refused before tensors go to a device that the engine does not serve.
         resolve_engine_name(cfg.sim.engine, device)
         self.cfg = cfg
@@ -226,14 +228,13 @@ class ManagerBasedRlEnv:
 
         A `seed` reseeds every random number generator. Observations are those of all
         environments; only those of `env_ids` advance their delay and history buffers.
+
+        Raises:
+            ValueError: `env_ids` out of range, not integers, or a mask of another length.
         """
+        env_ids = as_reset_ids(env_ids, self.num_envs, self.device)
         if seed is not None:
             self.seed(seed)
-        if env_ids is None:
-            env_ids = torch.arange(self.num_envs, dtype=torch.long, device=self.device)
-        else:
-            env_ids = torch.as_tensor(env_ids, device=self.device).flatten()
-            env_ids = env_ids.nonzero().flatten() if env_ids.dtype == torch.bool else env_ids.long()
         self.extras["log"] = {}
         stepped = env_ids[self.episode_length_buf[env_ids] > 0]
         if len(stepped) > 0:
@@ -259,7 +260,7 @@ class ManagerBasedRlEnv:
         commands and observations read everything current.
 
         Args:
-            action: (N, A) float tensor.
+            action: (N, A) float tensor; an array or a list is converted.
 
         Returns:
             Observations (of the new episode where an environment was reset); reward (N,);
@@ -267,13 +268,13 @@ class ManagerBasedRlEnv:
             observations are overwritten by the next step.
 
         Raises:
-            ValueError: an action of another shape, or one that is not finite.
+            ValueError: an action of another shape, of no numbers, or one that is not finite.
             RuntimeError: without `auto_reset`, an environment that is done was not reset.
         """
         if not self.cfg.auto_reset:
             self._refuse_pending_resets()
         self.extras["log"] = {}
-        self.action_manager.process_action(action.to(self.device))
+        self.action_manager.process_action(as_action(action, self.device))
         self._run_physics()
         self.episode_length_buf += 1
         self.common_step_counter += 1

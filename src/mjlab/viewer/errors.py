@@ -27,4 +27,6 @@ class RenderingUnavailableError(RuntimeError):
         reason = " ".join(str(cause).split()) or type(cause).__name__
         if _NO_EGL in reason:
             reason = "no EGL library or driver was found"
-        return cls(f"Cannot render offscreen (MUJOCO_GL={backend}): {reason.rstrip('.')}. {_INSTALL_HINT}")
+        return cls(
+            f"Cannot render offscreen (MUJOCO_GL={backend}): {reason.rstrip('.')}. {_INSTALL_HINT}"
+        )

@@ -1,0 +1,177 @@
+"""What an environment refuses to be given, and what it converts."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+from mjlab.envs import ManagerBasedRlEnv, env_checks
+from mjlab.envs import manager_based_rl_env as env_module
+from mjlab.envs.env_checks import as_action, as_reset_ids, check_device
+from mjlab.tasks.registry import load_env_cfg
+
+NUM_ENVS = 6
+
+
+def cartpole():
+    cfg = load_env_cfg("Mjlab-Cartpole-Swingup")
+    cfg.scene.num_envs, cfg.seed, cfg.sim.engine = NUM_ENVS, 5, "native"
+    return cfg
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = ManagerBasedRlEnv(cartpole(), device="cpu")
+    env.reset()
+    yield env
+    env.close()
+
+
+@pytest.fixture
+def nothing_is_built(monkeypatch):
+    def fail(*args, **kwargs):
+        pytest.fail("the scene was built before the check")
+
+    monkeypatch.setattr(env_module, "Scene", fail)
+
+
+# The config.
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("decimation", 2.5, "decimation is 2.5.*whole number"),
+        ("decimation", True, "decimation is True"),
+        ("decimation", "4", "decimation is '4'"),
+        ("scene.num_envs", "4", "scene.num_envs is '4'.*whole number"),
+        ("scene.num_envs", 4.0, "scene.num_envs is 4.0"),
+        ("scene.entities", {"x": None}, r"scene.entities\['x'\] is None"),
+        ("sim.mujoco.timestep", "0.01", "timestep is '0.01'"),
+        ("episode_length_s", math.inf, "episode_length_s is inf.*finite"),
+        ("episode_length_s", math.nan, "episode_length_s is nan.*finite"),
+        ("episode_length_s", None, "episode_length_s is None"),
+    ],
+)
+@pytest.mark.usefixtures("nothing_is_built")
+def test_a_config_that_cannot_work_is_refused_before_anything_is_built(path, value, words):
+    cfg = cartpole()
+    *parents, field = path.split(".")
+    owner = cfg
+    for parent in parents:
+        owner = getattr(owner, parent)
+    setattr(owner, field, value)
+    with pytest.raises(ValueError, match=words):
+        ManagerBasedRlEnv(cfg, device="cpu")
+
+
+def test_whole_numbers_of_numpy_are_whole_numbers():
+    cfg = cartpole()
+    cfg.decimation, cfg.scene.num_envs = np.int64(2), np.int32(3)
+    env_checks.check_env_cfg(cfg)
+
+
+# The device.
+
+
+@pytest.mark.parametrize("device", ["gpu", "cuda:x", "", "meta", None, 0])
+@pytest.mark.usefixtures("nothing_is_built")
+def test_what_is_no_device_is_refused(device):
+    with pytest.raises(ValueError, match=r"device is .*not a device name.*'cpu', 'cuda'"):
+        ManagerBasedRlEnv(cartpole(), device=device)
+
+
+def test_cuda_is_refused_where_there_is_none(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError, match="'cuda:0'.*no CUDA.*'cpu'"):
+        check_device("cuda:0")
+
+
+def test_a_gpu_that_is_not_there_is_refused(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    for device in ("cpu", "cuda", "cuda:1"):
+        check_device(device)
+    with pytest.raises(ValueError, match="'cuda:2'.*0 to 1"):
+        check_device("cuda:2")
+
+
+# Actions.
+
+
+def test_arrays_and_lists_act_as_tensors_do(env):
+    action = torch.linspace(-1.0, 1.0, NUM_ENVS)[:, None]
+    array = action.double().numpy()
+    array.flags.writeable = False
+    for given in (action, array, action.numpy(), action.tolist()):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            env.step(given)
+        torch.testing.assert_close(env.action_manager.action, action)
+    assert as_action([[1]], "cpu").dtype == torch.float32
+
+
+def test_an_array_is_copied():
+    array = np.zeros((2, 1), dtype=np.float32)
+    action = as_action(array, "cpu")
+    array[:] = 1.0
+    assert (action == 0.0).all()
+
+
+@pytest.mark.parametrize("action", [None, "left", {"a": 1}, [[1.0], [1.0, 2.0]], object()])
+def test_an_action_of_no_numbers_is_refused(env, action):
+    with pytest.raises(ValueError, match=r"The action is a .*\(environments, components\)"):
+        env.step(action)
+
+
+def test_an_array_of_another_shape_is_refused(env):
+    with pytest.raises(ValueError, match=r"shape \(6, 2\), expected \(6, 1\)"):
+        env.step(np.zeros((NUM_ENVS, 2)))
+
+
+# Environments to reset.
+
+
+@pytest.mark.parametrize(
+    ("env_ids", "expected"),
+    [
+        (None, [0, 1, 2, 3, 4, 5]),
+        (slice(4, None), [4, 5]),
+        (3, [3]),
+        ([], []),
+        ([5, 0], [5, 0]),
+        (np.array([1, 2], dtype=np.int32), [1, 2]),
+        (torch.tensor([1], dtype=torch.uint8), [1]),
+        ([False, True, False, False, True, False], [1, 4]),
+        (torch.zeros(NUM_ENVS, dtype=torch.bool), []),
+    ],
+)
+def test_environments_are_named_in_many_ways(env_ids, expected):
+    ids = as_reset_ids(env_ids, NUM_ENVS, "cpu")
+    assert ids.tolist() == expected
+    assert ids.dtype == torch.long
+
+
+@pytest.mark.parametrize(
+    ("env_ids", "words"),
+    [
+        ([0, 6], r"got \[6\]"),
+        (torch.tensor([-1]), r"got \[-1\]"),
+        (torch.ones(5, dtype=torch.bool), "mask of length 5"),
+        (torch.tensor([0.0, 1.0]), "float32"),
+        ([1.5], "float32"),
+        ("all", "got 'all'"),
+        ([None], r"got \[None\]"),
+    ],
+)
+def test_environments_that_do_not_exist_are_refused_and_nothing_changes(env, env_ids, words):
+    env.step(torch.zeros(NUM_ENVS, 1))
+    before, state = env.episode_length_buf.clone(), torch.get_rng_state()
+    with pytest.raises(ValueError, match=f"integers from 0 to 5.*{words}"):
+        env.reset(env_ids=env_ids, seed=3)
+    assert torch.equal(env.episode_length_buf, before)
+    assert torch.equal(torch.get_rng_state(), state), "no generator may be reseeded"
