@@ -15,6 +15,8 @@ from typing import Any
 
 import torch
 
+from mjlab.rl.plain_data import as_plain_data
+
 _TEMPORARY_SUFFIX = ".tmp"
 
 
@@ -51,12 +53,21 @@ def save_checkpoint(data: Mapping[str, Any], path: str | os.PathLike[str]) -> No
 
     The file appears whole or not at all: everything goes to a temporary file in the same folder,
     which is flushed to the disk and then renamed. Whatever was at `path` stays until then, and
-    nothing is left behind on failure.
+    nothing is left behind on failure. Numbers of numpy are written as Python's.
 
     Raises:
-        CheckpointError: the disk is full, the folder is read-only, and the like.
+        CheckpointError: the disk is full, the folder is read-only, and the like; or `data` holds
+            something that `load_checkpoint` would refuse, which the message names.
     """
     path = Path(path)
+    try:
+        data = as_plain_data(dict(data))
+    except TypeError as error:
+        raise CheckpointError(
+            f"The checkpoint {str(path)!r} was not written, because it could not be loaded again: "
+            f"{error}. A checkpoint may hold tensors, numbers, strings, None, and dicts, lists and "
+            "tuples of those; convert this entry, or leave it out."
+        ) from error
     temporary: str | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.rl.rng import preserved_rng
+from mjlab.rl.threads import threads_for_policy
 
 if TYPE_CHECKING:
     from mjlab.rl.vecenv_wrapper import RslRlVecEnvWrapper
@@ -85,7 +86,8 @@ def evaluate_policy(
 
     Each environment is scored once in a round, on its first episode after a reset, so that short
     episodes do not count more often than long ones. Where more episodes are asked for than there
-    are environments, there are several rounds.
+    are environments, there are several rounds. On the CPU, torch gets as many threads as the policy
+    is worth.
 
     Args:
         env: The environments; their state is not kept.
@@ -107,7 +109,7 @@ def evaluate_policy(
         env.seed(seed)
     start = time.perf_counter()
     rounds = []
-    with torch.inference_mode():
+    with threads_for_policy(policy, env.num_envs, env.device), torch.inference_mode():
         for first in range(0, num_episodes, env.num_envs):
             count = min(env.num_envs, num_episodes - first)
             rounds.append(_play_round(env, policy, count, max_steps, success_func))

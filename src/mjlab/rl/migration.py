@@ -15,21 +15,71 @@ _STD_NAMES = {
 }
 
 
-def migrate(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `checkpoint` in today's layout; the argument is not changed.
+# The entries whose type is known, whoever wrote the file: a dict, or a number of iterations.
+_DICT_ENTRIES = (
+    "model_state_dict", "actor_state_dict", "critic_state_dict", "student_state_dict",
+    "teacher_state_dict", "optimizer_state_dict", "rnd_state_dict", "rnd_optimizer_state_dict",
+    "infos", "training_state",
+)  # fmt: skip
+_COUNT_ENTRIES = {"iter": -1, "iterations_finished": 0, "last_evaluated": 0}
+
+
+def migrate(checkpoint: Mapping[str, Any], path: str = "") -> dict[str, Any]:
+    """Return `checkpoint`, read from `path`, in today's layout; the argument is not changed.
 
     Two older layouts are known: one state dict for actor and critic together
     (`model_state_dict`), and an actor whose standard deviation is called `std` or `log_std`.
+
+    Raises:
+        CheckpointError: an entry is not of the type that it must have.
     """
+    _check_types(checkpoint, path)
     migrated = dict(checkpoint)
-    if "model_state_dict" in migrated:
+    if migrated.get("model_state_dict") is not None:
         migrated.update(_split_single_model(migrated.pop("model_state_dict")))
-    if "actor_state_dict" in migrated:
+    if migrated.get("actor_state_dict") is not None:
         migrated["actor_state_dict"] = {
             _STD_NAMES.get(name, name): value
             for name, value in migrated["actor_state_dict"].items()
         }
     return migrated
+
+
+def _check_types(checkpoint: Mapping[str, Any], path: str) -> None:
+    for name in _DICT_ENTRIES:
+        value = checkpoint.get(name)
+        # None stands for an entry that is not there: rsl_rl writes `infos` so.
+        if value is not None and not isinstance(value, dict):
+            raise _malformed(path, name, "a dict", value)
+        if value is not None and name.endswith("_state_dict"):
+            for key in value:
+                if not isinstance(key, str):
+                    raise _malformed(path, f"a key of {name}", "a string", key)
+    for name, least in _COUNT_ENTRIES.items():
+        if name in checkpoint and not _is_count(checkpoint[name], least):
+            raise _malformed(path, name, f"a whole number from {least} up", checkpoint[name])
+    env_state = (checkpoint.get("infos") or {}).get("env_state")
+    if env_state is None:
+        return
+    if not isinstance(env_state, dict):
+        raise _malformed(path, "infos.env_state", "a dict", env_state)
+    counter = env_state.get("common_step_counter", 0)
+    if not _is_count(counter, 0):
+        name = "infos.env_state.common_step_counter"
+        raise _malformed(path, name, "a whole number from 0 up", counter)
+
+
+def _is_count(value: Any, least: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+
+def _malformed(path: str, name: str, allowed: str, value: Any) -> CheckpointError:
+    shown = repr(value)
+    shown = shown if len(shown) <= 60 else f"{shown[:57]}..."
+    return CheckpointError(
+        f"The checkpoint {path!r} is malformed: {name} must be {allowed} and is {shown} "
+        f"({type(value).__name__}). Use another checkpoint; nothing was changed."
+    )
 
 
 def _split_single_model(model: Mapping[str, torch.Tensor]) -> dict[str, Any]:
@@ -76,3 +126,39 @@ def check_fits(
         f"{name} config.\n" + "\n".join(lines) + "\nUse a checkpoint of this task, or set "
         f"--agent.{name}.hidden-dims and the observations as they were when it was trained."
     )
+
+
+def check_optimizer_fits(
+    optimizer: torch.optim.Optimizer, saved: Mapping[str, Any] | None, *, path: str
+) -> None:
+    """Check that the state `saved` is of as many parameters of the same shapes.
+
+    torch itself compares numbers of parameters only, and would fail at the next update.
+
+    Raises:
+        CheckpointError: it is not.
+    """
+    try:
+        fits = saved is not None and _optimizer_fits(optimizer, saved)
+    except (KeyError, TypeError, AttributeError):
+        fits = False
+    if not fits:
+        raise CheckpointError(
+            f"The checkpoint {path!r} holds no optimizer state for these networks. To use its "
+            "policy only, load it with load_cfg={'actor': True}; nothing was changed."
+        )
+
+
+def _optimizer_fits(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> bool:
+    groups = saved["param_groups"]
+    if len(groups) != len(optimizer.param_groups):
+        return False
+    for group, own in zip(groups, optimizer.param_groups, strict=True):
+        if len(group["params"]) != len(own["params"]) or not isinstance(group["lr"], float):
+            return False
+        for number, parameter in zip(group["params"], own["params"], strict=True):
+            for value in saved["state"].get(number, {}).values():
+                is_moment = isinstance(value, torch.Tensor) and value.dim() > 0
+                if is_moment and value.shape != parameter.shape:
+                    return False
+    return True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import io
 import logging
 import os
@@ -22,7 +23,7 @@ from mjlab.rl.checkpoint import (
 )
 from mjlab.rl.evaluate import EvaluationResult, reward_unit
 from mjlab.rl.exporter_utils import attach_metadata_to_onnx, get_base_metadata
-from mjlab.rl.migration import check_fits, migrate
+from mjlab.rl.migration import check_fits, check_optimizer_fits, migrate
 from mjlab.rl.onnx_export import export_to_onnx
 from mjlab.rl.progress import IterationStats, TrainingObserver
 from mjlab.rl.rsl import (
@@ -115,7 +116,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         Raises:
             RunFolderError: the run folder cannot be written to; raised before any training.
             CheckpointError: a checkpoint could not be written.
-            ValueError: the environment returned NaN.
+            ValueError: the environment returned NaN, or Weights & Biases started no run.
         """
         first = self.current_learning_iteration
         if self._writes and self.logger.log_dir is not None:
@@ -129,26 +130,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             ):
                 observations = self._start(init_at_random_ep_len)
                 self._tell("on_start", first, num_learning_iterations)
-                reason = ""
-                for iteration in range(first, num_learning_iterations):
-                    begin = time.perf_counter()
-                    with torch.inference_mode():
-                        observations = self._collect(observations)
-                        collected = time.perf_counter()
-                        self.alg.compute_returns(observations)
-                    losses = self.alg.update()
-                    learned = time.perf_counter()
-                    self._observations = observations
-                    self.current_learning_iteration = iteration + 1
-                    stats = self._report(
-                        iteration, first, num_learning_iterations,
-                        collected - begin, learned - collected, losses,
-                    )  # fmt: skip
-                    reason = self._reason_to_stop(stop, stats)
-                    if reason or iteration + 1 == num_learning_iterations:
-                        break
-                    if iteration % self.cfg["save_interval"] == 0:
-                        self._save_checkpoint()
+                reason = self._iterate(observations, num_learning_iterations, stop)
                 self._finish(first, num_learning_iterations)
                 self.stop_reason = reason or "finished"
         finally:
@@ -171,6 +153,29 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             observations = self.env.get_observations().to(self.device)
         self._observations = observations
         return observations
+
+    def _iterate(self, observations: TensorDict, total: int, stop: StopRequest) -> str:
+        """Train until `total` iterations are finished; return why it ended before, or ""."""
+        first = self.current_learning_iteration
+        for iteration in range(first, total):
+            begin = time.perf_counter()
+            with torch.inference_mode():
+                observations = self._collect(observations)
+                collected = time.perf_counter()
+                self.alg.compute_returns(observations)
+            losses = self.alg.update()
+            learned = time.perf_counter()
+            self._observations = observations
+            self.current_learning_iteration = iteration + 1
+            stats = self._report(
+                iteration, first, total, collected - begin, learned - collected, losses
+            )
+            reason = self._reason_to_stop(stop, stats)
+            if reason:
+                return reason
+            if iteration + 1 < total and iteration % self.cfg["save_interval"] == 0:
+                self._save_checkpoint()
+        return ""
 
     def _collect(self, observations: TensorDict) -> TensorDict:
         """Step all environments `num_steps_per_env` times; return the last observations."""
@@ -212,7 +217,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
 
     def _reason_to_stop(self, stop: StopRequest, stats: IterationStats) -> str:
         """Return "solved" or "interrupted" if training should end here, else ""."""
-        solved = self._writes and self._is_solved(stats)
+        # Whoever asks to stop does not want to wait for an evaluation first.
+        solved = not stop.requested and self._writes and self._is_solved(stats)
         code = 2 if stop.requested else int(solved)
         if self.is_distributed:
             # All processes have to leave the loop at the same iteration.
@@ -317,18 +323,12 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             The `infos` given to `save`.
 
         Raises:
-            CheckpointError: the file is missing, corrupt, hostile, or of another network.
+            CheckpointError: the file is missing, corrupt, hostile, malformed, or of another
+                network; nothing was changed then.
         """
-        checkpoint = migrate(load_checkpoint(path))
-        if strict:
-            self._check_networks(checkpoint, load_cfg, str(path))
-        try:
-            with_iteration = self.alg.load(checkpoint, load_cfg, strict)
-        except (KeyError, ValueError, RuntimeError) as error:
-            raise CheckpointError(
-                f"The checkpoint {str(path)!r} does not fit this algorithm: {error}. To use its "
-                "policy only, load it with load_cfg={'actor': True}."
-            ) from error
+        checkpoint = migrate(load_checkpoint(path), str(path))
+        self._check_parts(checkpoint, load_cfg, strict, str(path))
+        with_iteration = self._load_algorithm(checkpoint, load_cfg, strict, str(path))
         if with_iteration:
             finished = checkpoint.get("iterations_finished", checkpoint.get("iter", -1) + 1)
             self.current_learning_iteration = finished
@@ -341,13 +341,31 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self._observations = None
         return infos
 
-    def _check_networks(
-        self, checkpoint: Mapping[str, Any], load_cfg: dict | None, path: str
+    def _check_parts(
+        self, checkpoint: Mapping[str, Any], load_cfg: dict | None, strict: bool, path: str
     ) -> None:
         for name in ("actor", "critic"):
             model = getattr(self.alg, f"_raw_{name}", None)
-            if model is not None and (load_cfg is None or load_cfg.get(name)):
+            if strict and model is not None and (load_cfg is None or load_cfg.get(name)):
                 check_fits(model, checkpoint.get(f"{name}_state_dict"), name=name, path=path)
+        if load_cfg is None or load_cfg.get("optimizer"):
+            saved = checkpoint.get("optimizer_state_dict")
+            check_optimizer_fits(self.alg.optimizer, saved, path=path)
+
+    def _load_algorithm(
+        self, checkpoint: dict[str, Any], load_cfg: dict | None, strict: bool, path: str
+    ) -> bool:
+        """Let rsl_rl load its parts; return whether the count of iterations is to be loaded."""
+        # rsl_rl loads one part after the other, and what fits only in part is half loaded then.
+        before = copy.deepcopy(self.alg.save())
+        try:
+            return self.alg.load(checkpoint, load_cfg, strict)
+        except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
+            self.alg.load(before, None, True)
+            raise CheckpointError(
+                f"The checkpoint {path!r} does not fit this algorithm: {error}. To use its "
+                "policy only, load it with load_cfg={'actor': True}."
+            ) from error
 
     def _resumed_observations(self) -> TensorDict | None:
         state, self._state_to_resume = self._state_to_resume, None

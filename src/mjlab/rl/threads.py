@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Generator
+from typing import Any
 
 import torch
 
@@ -53,3 +54,25 @@ def using_torch_threads(count: int) -> Generator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+@contextlib.contextmanager
+def threads_for_policy(policy: Any, batch_size: int, device: Any) -> Generator[None]:
+    """Let torch use as many threads within the block as playing `policy` is worth.
+
+    Args:
+        policy: A module, a method of one, or any function; one that is no module counts as small.
+        batch_size: Rows of an observation: the number of environments.
+        device: Where the policy runs. On a GPU nothing is changed.
+
+    Raises:
+        ValueError: `MJLAB_TORCH_THREADS` or `OMP_NUM_THREADS` is no positive whole number.
+    """
+    if torch.device(device).type != "cpu":
+        yield
+        return
+    module = getattr(policy, "__self__", policy)
+    is_module = isinstance(module, torch.nn.Module)
+    size = sum(parameter.numel() for parameter in module.parameters()) if is_module else 0
+    with using_torch_threads(torch_threads(size, batch_size)):
+        yield
