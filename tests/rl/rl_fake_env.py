@@ -43,6 +43,7 @@ class FakeEnv:
         self.position = torch.zeros(self.num_envs, 2)
         self.drift = torch.zeros(self.num_envs, 2)
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long)
+        self.reset_terminated = torch.zeros(self.num_envs, dtype=torch.bool)
         self.closed = False
         self.seen_actions: torch.Tensor | None = None
         if cfg.seed is not None:
@@ -81,6 +82,7 @@ class FakeEnv:
             terminated = torch.ones_like(terminated)
         truncated = self.episode_length_buf >= self.max_episode_length
         log = {"Metrics/distance": self.position.norm(dim=-1).mean(), "plain": 2.0}
+        self.reset_terminated = terminated
         self._start_episodes(terminated | truncated)
         return self.get_observations(), reward, terminated, truncated, {"log": log}
 

@@ -10,7 +10,8 @@ import torch
 from rl_fake_env import FakeEnv, FakeEnvCfg, FakeSceneCfg
 
 from mjlab.rl import RslRlVecEnvWrapper
-from mjlab.rl.evaluate import evaluate_policy, make_evaluation_env, wilson_interval
+from mjlab.rl.evaluate import evaluate_policy, make_evaluation_env
+from mjlab.rl.evaluation_result import wilson_interval
 
 
 class CountingEnv(FakeEnv):
@@ -81,6 +82,51 @@ def test_success_is_by_return_or_by_function():
         counting(), still, success_func=lambda env: env.episode_length_buf >= 3
     )
     assert by_function.success_rate == 0.25
+
+
+def test_metrics_are_averaged_over_the_steps_of_an_episode_and_then_over_episodes():
+    # Before its steps environment i has seen 0, ..., i steps, which is i/2 on average.
+    result = evaluate_policy(
+        counting(), still, metrics={"steps": lambda env: env.episode_length_buf.float()}
+    )
+    steps = result.metrics["steps"]
+    assert steps.mean == 0.75
+    half = 1.959964 * torch.tensor([0.0, 0.5, 1.0, 1.5]).std().item() / 2
+    assert steps.interval == pytest.approx((0.75 - half, 0.75 + half))
+    assert result.to_dict()["metrics"]["steps"]["mean"] == 0.75
+
+
+def test_a_metric_that_is_infinite_after_the_episode_does_not_reach_it():
+    def blow_up(env):
+        first_episode = env.episode == 1
+        return torch.where(first_episode, 1.0, torch.inf)
+
+    assert evaluate_policy(counting(), still, metrics={"x": blow_up}).metrics["x"].mean == 1.0
+
+
+def test_failures_are_episodes_that_a_termination_ended():
+    class Failing(CountingEnv):
+        def step(self, action):
+            *rest, done, truncated, extras = super().step(action)
+            # The first and the last environment fail; the others run out of time.
+            self.reset_terminated = done & torch.tensor([True, False, False, True])
+            return *rest, self.reset_terminated, done & ~self.reset_terminated, extras
+
+    env = RslRlVecEnvWrapper(Failing(FakeEnvCfg(scene=FakeSceneCfg(num_envs=4), episode_steps=20)))
+    result = evaluate_policy(env, still)
+    assert result.failure_rate == 0.5
+    assert result.failure_interval == wilson_interval(0.5, 4)
+    assert evaluate_policy(counting(), still).failure_rate == 0.0
+
+
+def test_a_figure_is_found_by_name_and_an_unknown_one_is_refused():
+    result = evaluate_policy(counting(), still, metrics={"one": lambda env: torch.ones(4)})
+    assert result.figure("one") == 1.0
+    assert result.figure("mean_return") == 5.0
+    with pytest.raises(ValueError, match="no figure 'two'; it has one, mean_return, mean_length"):
+        result.figure("two")
+    with pytest.raises(ValueError, match="no figure 'success_rate'"):
+        result.figure("success_rate")
 
 
 def test_json_has_the_figures_without_the_single_returns():

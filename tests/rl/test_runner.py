@@ -240,6 +240,29 @@ def test_training_goes_on_when_told_so_and_when_not_solved(make_runner):
     assert untried.last_evaluation is None
 
 
+def test_a_task_may_be_solved_by_its_metrics(make_runner):
+    metrics = {"distance": lambda env: env.position.norm(dim=-1)}
+    cfg = {"num_episodes": 4, "min_interval": 1, "metrics": metrics}
+    near = make_runner(evaluation=asdict(EvaluationCfg(solved_below={"distance": 9.0}, **cfg)))
+    near.learn(3)
+    assert near.stop_reason == "solved"
+    far = make_runner(evaluation=asdict(EvaluationCfg(solved_above={"distance": 9.0}, **cfg)))
+    far.learn(3)
+    assert far.stop_reason == "finished"
+    assert far.last_evaluation.metrics["distance"].mean < 9.0
+    waiting = make_runner(
+        evaluation=asdict(EvaluationCfg(solved_below={"distance": 9.0}, trigger_return=13.0, **cfg))
+    )
+    waiting.learn(3)
+    assert waiting.last_evaluation is None
+
+
+@pytest.mark.parametrize("name", ["speed", "success_rate"])
+def test_conditions_on_what_is_not_measured_are_refused_at_once(make_runner, name):
+    with pytest.raises(ValueError, match=f"names '{name}', which is not measured"):
+        make_runner(evaluation=asdict(EvaluationCfg(solved_below={name: 1.0})))
+
+
 def test_statistics_are_those_of_the_episodes(make_runner, tmp_path: Path):
     runner, recorder = make_runner(env_cfg={"always_terminate": True}), Recorder()
     runner.observers.append(recorder)

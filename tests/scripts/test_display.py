@@ -8,7 +8,7 @@ import io
 import pytest
 from rich.console import Console
 
-from mjlab.rl.evaluate import EvaluationResult
+from mjlab.rl.evaluation_result import EvaluationResult
 from mjlab.rl.progress import IterationStats
 from mjlab.scripts import display
 from mjlab.scripts.display import TrainingDisplay, duration

@@ -82,7 +82,17 @@ class EvaluationCfg:
     """
 
     solved_return: float | None = None
-    """Mean evaluation return from which the task counts as solved. None: nothing is evaluated."""
+    """Mean evaluation return from which the task counts as solved. None, and
+    no other condition: nothing is evaluated."""
+    solved_below: dict[str, float] = field(default_factory=dict)
+    """Further conditions, all to be met: the largest value of figures by name. A figure is a metric
+    of `metrics`, `failure_rate`, `success_rate` or `mean_length`. `solved_return` may be None
+    then."""
+    solved_above: dict[str, float] = field(default_factory=dict)
+    """Likewise the smallest value of figures."""
+    metrics: dict[str, Callable[[Any], Any]] = field(default_factory=dict)
+    """What evaluations measure beside the return: `func(env) -> (num_envs,)` by name, averaged over
+    the steps of an episode."""
     stop_when_solved: bool = True
     """Whether training stops there."""
     num_episodes: int = 256
@@ -91,6 +101,8 @@ class EvaluationCfg:
     """An evaluation takes time, so it waits until the mean reward of the training data, times the
     length of an episode, reaches this fraction of `solved_return`. Below 1, because training
     explores."""
+    trigger_return: float | None = None
+    """Instead of `trigger_fraction`, the return of the training data to wait for."""
     min_interval: int = 3
     """Iterations from one evaluation to the next, at least."""
     success_return: float | None = None

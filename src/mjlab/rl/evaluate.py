@@ -4,72 +4,28 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import json
-import math
+import operator
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.rl.evaluation_result import Episodes, EvaluationResult, summarize
 from mjlab.rl.rng import preserved_rng
 from mjlab.rl.threads import threads_for_policy
 
 if TYPE_CHECKING:
     from mjlab.rl.vecenv_wrapper import RslRlVecEnvWrapper
 
-# Two-sided 95 % of the normal distribution.
-_Z95 = 1.959964
 # Whether all episodes have ended is asked this often, because asking makes the host wait for a GPU.
 _STEPS_BETWEEN_CHECKS = 16
 _LONGEST_EPISODE = 1_000_000
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class EvaluationResult:
-    """Figures over the episodes of an evaluation.
-
-    The return of an episode is the sum of its weighted rewards before scaling by the step's
-    duration.
-    """
-
-    num_episodes: int
-    """Episodes scored."""
-    mean_return: float
-    """Mean return."""
-    return_interval: tuple[float, float]
-    """95 % confidence interval of the mean return (normal approximation)."""
-    std_return: float
-    """Standard deviation of the return between episodes."""
-    min_return: float
-    """Lowest return."""
-    max_return: float
-    """Highest return."""
-    mean_length: float
-    """Mean length of an episode, in environment steps."""
-    success_rate: float | None = None
-    """Fraction of episodes that succeeded; None where the task does not define success."""
-    success_interval: tuple[float, float] | None = None
-    """95 % confidence interval of the success rate (Wilson)."""
-    num_unfinished: int = 0
-    """Episodes that were cut off by `max_steps`."""
-    duration: float = 0.0
-    """Time taken, in seconds."""
-    returns: tuple[float, ...] = dataclasses.field(default=(), repr=False)
-    """Return of each episode."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return all figures but the single returns."""
-        figures = dataclasses.asdict(self)
-        del figures["returns"]
-        return figures
-
-    def to_json(self) -> str:
-        """Return the figures as JSON."""
-        return json.dumps(self.to_dict(), indent=2)
-
-
 Policy = Callable[[Any], torch.Tensor]
+PerEnv = Callable[[Any], torch.Tensor]
+"""`func(env) -> (num_envs,)`: something that is known of every environment at every step."""
 
 
 def evaluate_policy(
@@ -79,7 +35,8 @@ def evaluate_policy(
     *,
     max_steps: int | None = None,
     success_return: float | None = None,
-    success_func: Callable[[Any], torch.Tensor] | None = None,
+    success_func: PerEnv | None = None,
+    metrics: Mapping[str, PerEnv] | None = None,
     seed: int | None = None,
 ) -> EvaluationResult:
     """Play episodes and score them.
@@ -98,6 +55,8 @@ def evaluate_policy(
         success_return: An episode with at least this return is a success.
         success_func: Instead, `func(env) -> (num_envs,) bool`; its value one step before the end
             of an episode decides.
+        metrics: For each name, `func(env) -> (num_envs,)`, read before every step and averaged over
+            the steps of an episode.
         seed: Seed of the evaluation; None leaves the generators as they are.
 
     Raises:
@@ -112,13 +71,13 @@ def evaluate_policy(
     with threads_for_policy(policy, env.num_envs, env.device), torch.inference_mode():
         for first in range(0, num_episodes, env.num_envs):
             count = min(env.num_envs, num_episodes - first)
-            rounds.append(_play_round(env, policy, count, max_steps, success_func))
-    returns, lengths, finished, successes = (
-        torch.cat(column) for column in zip(*rounds, strict=False)
-    )
-    if success_func is None:
-        successes = None if success_return is None else returns >= success_return
-    return _summarize(returns, lengths, finished, successes, time.perf_counter() - start)
+            record = _Recorder(env, count, success_func, metrics or {})
+            rounds.append(_play_round(env, policy, record, max_steps))
+    episodes = reduce(operator.add, rounds)
+    successes = episodes.succeeded if success_func is not None else None
+    if successes is None and success_return is not None:
+        successes = episodes.returns >= success_return
+    return summarize(episodes, successes, time.perf_counter() - start)
 
 
 def _resolve_max_steps(env: RslRlVecEnvWrapper, num_episodes: int, max_steps: int | None) -> int:
@@ -137,35 +96,79 @@ def _resolve_max_steps(env: RslRlVecEnvWrapper, num_episodes: int, max_steps: in
 
 
 def _play_round(
-    env: RslRlVecEnvWrapper,
-    policy: Policy,
-    count: int,
-    max_steps: int,
-    success_func: Callable[[Any], torch.Tensor] | None,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Score the first episode of the first `count` environments."""
+    env: RslRlVecEnvWrapper, policy: Policy, record: _Recorder, max_steps: int
+) -> Episodes:
+    """Record the first episode of each environment that `record` looks at."""
     reset_policy = getattr(policy, "reset", None)
     observations, _ = env.reset()
     if reset_policy is not None:
         reset_policy()
-    returns = torch.zeros(env.num_envs, dtype=torch.float64, device=env.device)
-    lengths = torch.zeros(env.num_envs, dtype=torch.long, device=env.device)
-    running = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
-    running[count:] = False
-    succeeded = torch.zeros_like(running)
     for step in range(max_steps):
-        if success_func is not None:
-            succeeded = torch.where(running, success_func(env.unwrapped).bool(), succeeded)
+        record.before_step()
         observations, rewards, dones, _ = env.step(policy(observations).to(env.device))
-        returns += rewards * running
-        lengths += running
-        running &= dones == 0
+        record.after_step(rewards, dones != 0)
         if reset_policy is not None:
             reset_policy(dones)
-        if (step + 1) % _STEPS_BETWEEN_CHECKS == 0 and not running.any():
+        if (step + 1) % _STEPS_BETWEEN_CHECKS == 0 and not record.running.any():
             break
-    returns /= reward_unit(env)
-    return returns[:count], lengths[:count], ~running[:count], succeeded[:count]
+    return record.episodes()
+
+
+class _Recorder:
+    """Takes down the first episode of the first `count` environments."""
+
+    def __init__(
+        self,
+        env: RslRlVecEnvWrapper,
+        count: int,
+        success_func: PerEnv | None,
+        metrics: Mapping[str, PerEnv],
+    ) -> None:
+        self._env, self._count = env, count
+        self._success_func, self._metrics = success_func, metrics
+
+        def zeros(dtype: torch.dtype) -> torch.Tensor:
+            return torch.zeros(env.num_envs, dtype=dtype, device=env.device)
+
+        self.running = ~zeros(torch.bool)
+        self.running[count:] = False
+        self._returns, self._lengths = zeros(torch.float64), zeros(torch.long)
+        self._failed, self._succeeded = zeros(torch.bool), zeros(torch.bool)
+        self._sums = {name: zeros(torch.float64) for name in metrics}
+        self._terminations: Any = getattr(env.unwrapped, "termination_manager", None)
+        names = self._terminations.active_terms if self._terminations else ()
+        self._ended_by = {name: zeros(torch.bool) for name in names}
+
+    def before_step(self) -> None:
+        unwrapped = self._env.unwrapped
+        if self._success_func is not None:
+            value = self._success_func(unwrapped).bool()
+            self._succeeded = torch.where(self.running, value, self._succeeded)
+        for name, func in self._metrics.items():
+            # Not multiplied, because zero times infinity would be NaN.
+            self._sums[name] += torch.where(self.running, func(unwrapped), 0.0)
+
+    def after_step(self, rewards: torch.Tensor, dones: torch.Tensor) -> None:
+        self._returns += rewards * self.running
+        self._lengths += self.running
+        ended = self.running & dones
+        self._failed |= ended & self._env.unwrapped.reset_terminated
+        for name, ended_by in self._ended_by.items():
+            ended_by |= ended & self._terminations.get_term(name)
+        self.running &= ~dones
+
+    def episodes(self) -> Episodes:
+        first = slice(self._count)
+        lengths = self._lengths[first]
+        return Episodes(
+            returns=self._returns[first] / reward_unit(self._env),
+            lengths=lengths,
+            finished=~self.running[first],
+            failed=self._failed[first],
+            succeeded=self._succeeded[first],
+            terminations={name: value[first] for name, value in self._ended_by.items()},
+            metrics={name: total[first] / lengths for name, total in self._sums.items()},
+        )
 
 
 def reward_unit(env: Any) -> float:
@@ -176,47 +179,6 @@ def reward_unit(env: Any) -> float:
     unwrapped = env.unwrapped
     scaled = getattr(unwrapped.cfg, "scale_rewards_by_dt", False)
     return float(unwrapped.step_dt) if scaled else 1.0
-
-
-def _summarize(
-    returns: torch.Tensor,
-    lengths: torch.Tensor,
-    finished: torch.Tensor,
-    successes: torch.Tensor | None,
-    duration: float,
-) -> EvaluationResult:
-    count = len(returns)
-    mean = returns.mean().item()
-    std = returns.std().item() if count > 1 else 0.0
-    half = _Z95 * std / math.sqrt(count)
-    rate = None if successes is None else successes.double().mean().item()
-    return EvaluationResult(
-        num_episodes=count,
-        mean_return=mean,
-        return_interval=(mean - half, mean + half),
-        std_return=std,
-        min_return=returns.min().item(),
-        max_return=returns.max().item(),
-        mean_length=lengths.double().mean().item(),
-        success_rate=rate,
-        success_interval=None if rate is None else wilson_interval(rate, count),
-        num_unfinished=int((~finished).sum().item()),
-        duration=duration,
-        returns=tuple(returns.tolist()),
-    )
-
-
-def wilson_interval(rate: float, count: int) -> tuple[float, float]:
-    """Return the 95 % interval of a success rate observed over `count` episodes.
-
-    Unlike the normal approximation it stays within [0, 1] and is not empty at 0 and 1:
-    (p + z^2/2n +- z sqrt(p(1-p)/n + z^2/4n^2)) / (1 + z^2/n).
-    """
-    shrink = 1.0 + _Z95**2 / count
-    centre = (rate + _Z95**2 / (2 * count)) / shrink
-    half = _Z95 * math.sqrt(rate * (1 - rate) / count + _Z95**2 / (4 * count**2)) / shrink
-    # The interval contains the rate; rounding must not say otherwise.
-    return max(0.0, min(centre - half, rate)), min(1.0, max(centre + half, rate))
 
 
 def make_evaluation_env(env: RslRlVecEnvWrapper, num_envs: int, seed: int) -> RslRlVecEnvWrapper:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from mjlab.rl.evaluate import EvaluationResult
+    from mjlab.rl.evaluation_result import EvaluationResult
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ from mjlab.rl.progress import IterationStats
 from mjlab.rl.rsl import Logger, enable_wandb
 
 if TYPE_CHECKING:
-    from mjlab.rl.evaluate import EvaluationResult
+    from mjlab.rl.evaluation_result import EvaluationResult
 
 logger = logging.getLogger(__name__)
 
@@ -198,6 +198,9 @@ class RunLogger(Logger):
         }
         if result.success_rate is not None:
             scalars["Evaluation/success_rate"] = result.success_rate
+        if result.failure_rate is not None:
+            scalars["Evaluation/failure_rate"] = result.failure_rate
+        scalars |= {f"Evaluation/{name}": value.mean for name, value in result.metrics.items()}
         self.write_scalars(scalars, iteration)
 
     def stop_logging_writer(self) -> None:

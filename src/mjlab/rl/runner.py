@@ -21,7 +21,8 @@ from mjlab.rl.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from mjlab.rl.evaluate import EvaluationResult, reward_unit
+from mjlab.rl.evaluate import reward_unit
+from mjlab.rl.evaluation_result import EvaluationResult
 from mjlab.rl.exporter_utils import attach_metadata_to_onnx, get_base_metadata
 from mjlab.rl.migration import check_fits, check_optimizer_fits, migrate
 from mjlab.rl.onnx_export import export_to_onnx

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
-from mjlab.rl.evaluate import EvaluationResult, evaluate_policy, make_evaluation_env
+from mjlab.rl.evaluate import evaluate_policy, make_evaluation_env
+from mjlab.rl.evaluation_result import FIGURES, EvaluationResult
 from mjlab.rl.progress import IterationStats
 from mjlab.rl.rng import preserved_rng
 
@@ -20,26 +22,47 @@ class SolvedCheck:
     """
 
     def __init__(self, env: Any, algorithm: Any, cfg: dict[str, Any], seed: int) -> None:
-        """Take the run's environments and algorithm, and an `EvaluationCfg` as a dict."""
+        """Take the run's environments and algorithm, and an `EvaluationCfg` as a dict.
+
+        Raises:
+            ValueError: a condition names what is not measured.
+        """
         self._env = env
         self._algorithm = algorithm
         self._cfg = cfg
         self._seed = seed + _SEED_OFFSET
+        self._below: dict[str, float] = cfg.get("solved_below") or {}
+        self._above: dict[str, float] = cfg.get("solved_above") or {}
+        target = cfg.get("solved_return")
+        self._has_target = target is not None or bool(self._below or self._above)
+        self._min_interval = int(cfg.get("min_interval", 3))
+        _check_conditions({**self._below, **self._above}, cfg)
         self._beside: Any = None
         self.last_iteration = 0
 
     def is_due(self, stats: IterationStats) -> bool:
         """Return whether the training data hint that the policy may be good enough."""
-        target = self._cfg.get("solved_return")
-        if target is None or stats.iteration - self.last_iteration < self._cfg["min_interval"]:
+        if not self._has_target or stats.iteration - self.last_iteration < self._min_interval:
             return False
-        expected = stats.mean_step_reward * int(self._env.max_episode_length)
-        return expected >= self._cfg["trigger_fraction"] * target
+        trigger = self._cfg.get("trigger_return")
+        if trigger is None:
+            solved_return = self._cfg.get("solved_return")
+            if solved_return is None:
+                return True
+            trigger = self._cfg["trigger_fraction"] * solved_return
+        return stats.mean_step_reward * int(self._env.max_episode_length) >= trigger
 
     def is_solved_by(self, result: EvaluationResult) -> bool:
-        """Return whether `result` reaches the return from which the task counts as solved."""
+        """Return whether `result` is good enough in all that the config asks for."""
+        if not self._has_target:
+            return False
         target = self._cfg.get("solved_return")
-        return target is not None and result.mean_return >= target
+        if target is not None and result.mean_return < target:
+            return False
+        # Written so that NaN meets nothing.
+        return all(result.figure(name) <= most for name, most in self._below.items()) and all(
+            result.figure(name) >= least for name, least in self._above.items()
+        )
 
     @property
     def stops_training(self) -> bool:
@@ -68,6 +91,7 @@ class SolvedCheck:
                     policy,
                     success_return=success_return,
                     success_func=self._cfg.get("success_func"),
+                    metrics=self._cfg.get("metrics"),
                     seed=self._seed,
                 )
         finally:
@@ -79,3 +103,16 @@ class SolvedCheck:
         if self._beside is not None:
             self._beside.close()
             self._beside = None
+
+
+def _check_conditions(names: Iterable[str], cfg: dict[str, Any]) -> None:
+    known = {*(cfg.get("metrics") or {}), *FIGURES}
+    defining_success = ("success_func", "success_return", "solved_return")
+    if all(cfg.get(name) is None for name in defining_success):
+        known.discard("success_rate")
+    for name in names:
+        if name not in known:
+            raise ValueError(
+                f"EvaluationCfg: solved_below or solved_above names {name!r}, which is not "
+                f"measured. Add it to `metrics`, or take one of {', '.join(sorted(known))}."
+            )

@@ -15,7 +15,7 @@ from rich.table import Table
 from mjlab.rl.progress import IterationStats, TrainingObserver
 
 if TYPE_CHECKING:
-    from mjlab.rl.evaluate import EvaluationResult
+    from mjlab.rl.evaluation_result import EvaluationResult
 
 # Plain lines are for log files: often enough to follow, rarely enough to read.
 _SECONDS_BETWEEN_LINES = 5.0
@@ -63,9 +63,12 @@ class TrainingDisplay(TrainingObserver):
     def on_evaluation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
         """Tell how an evaluation went."""
         verdict = "solved" if solved else "not solved yet"
+        figures = [f"mean return {result.mean_return:.1f} over {result.num_episodes} episodes"]
+        figures += [f"{name} {value.mean:.3f}" for name, value in result.metrics.items()]
+        if result.failure_rate:
+            figures.append(f"{result.failure_rate:.1%} failed")
         self._console.print(
-            f"Evaluation after {iteration} iterations: mean return {result.mean_return:.1f} over "
-            f"{result.num_episodes} episodes, {verdict}.",
+            f"Evaluation after {iteration} iterations: {', '.join(figures)}, {verdict}.",
             highlight=False,
             soft_wrap=True,
         )

@@ -43,11 +43,19 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
     env_cfg = env_cfg_of(task, cfg, play=False)
-    env = make_env(task, env_cfg, device, cfg.num_episodes, cfg.engine, seed=cfg.seed)
-    solved = load_rl_cfg(task).evaluation
+    env = make_env(
+        task,
+        env_cfg,
+        device,
+        cfg.num_episodes,
+        cfg.engine,
+        seed=cfg.seed,
+        profile=cfg.profile,
+    )
+    solved = load_rl_cfg(task, profile=cfg.profile).evaluation
     target = solved.solved_return if solved.success_return is None else solved.success_return
     try:
-        policy = make_policy(task, env, cfg.agent, checkpoint, device)
+        policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
         result = evaluate_policy(
             env,
             policy,
@@ -55,6 +63,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
             max_steps=cfg.max_steps,
             success_return=target,
             success_func=solved.success_func,
+            metrics=solved.metrics,
             seed=cfg.seed,
         )
         physics = env.unwrapped.sim.capabilities.description
@@ -89,4 +98,14 @@ def _table(figures: dict[str, Any], target: float | None) -> str:
             f"Success      {figures['success_rate']:.1%}   "
             f"95 % interval [{low:.1%}, {high:.1%}]{meaning}"
         )
+    if figures["failure_rate"] is not None:
+        low, high = figures["failure_interval"]
+        ended = [f"{name} {rate:.1%}" for name, rate in figures["terminations"].items() if rate]
+        lines.append(
+            f"Failures     {figures['failure_rate']:.1%}   "
+            f"95 % interval [{low:.1%}, {high:.1%}]   (ended by: {', '.join(ended) or 'nothing'})"
+        )
+    for name, value in figures["metrics"].items():
+        low, high = value["interval"]
+        lines.append(f"{name:<12} {value['mean']:.4g}   95 % interval [{low:.4g}, {high:.4g}]")
     return "\n".join(lines)
