@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import statistics
-import time
-from collections.abc import Callable
-
-import mjbatch
-import mujoco
 import numpy as np
 import torch
 from report import Row, show
+from timing import BareLoop, Sample, alternate
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.tasks.registry import load_env_cfg
 
 TASK = "Mjlab-Cartpole-Swingup"
 NUM_ENVS = 4096
-STEPS_PER_SAMPLE = 20
-SAMPLES = 15
 
 
 def make_env(num_threads: int) -> ManagerBasedRlEnv:
@@ -33,60 +26,25 @@ def make_env(num_threads: int) -> ManagerBasedRlEnv:
     return env
 
 
-def env_sample(env: ManagerBasedRlEnv, actions: torch.Tensor) -> Callable[[], None]:
-    """Return a function that steps the environments once."""
-    return lambda: env.step(actions) and None
-
-
-def bare_sample(
-    model: mujoco.MjModel, decimation: int, actions: torch.Tensor, num_threads: int
-) -> Callable[[], None]:
-    """Return a function that does the physics of one environment step, and nothing else.
-
-    State goes in and out as double-precision views, which cost `mjbatch` nothing.
-    """
-    batch = mjbatch.Batch(model, NUM_ENVS, num_threads)
-    qpos, ctrl = batch.bind("qpos"), batch.bind("ctrl")
-    batch.bind("qvel")
-    qpos[:, 1] = np.pi
-    controls = actions.numpy().astype(float)
-
-    def step() -> None:
-        ctrl[:] = controls
-        batch.step(nstep=decimation)
-        batch.forward()
-
-    return step
-
-
-def alternate(*samples: Callable[[], None]) -> list[float]:
-    """Return the median time of each sample, in seconds, taking turns so that noise hits all."""
-    for sample in samples:
-        for _ in range(5):
-            sample()
-    times: list[list[float]] = [[] for _ in samples]
-    for _ in range(SAMPLES):
-        for sample, taken in zip(samples, times, strict=True):
-            begin = time.perf_counter()
-            for _ in range(STEPS_PER_SAMPLE):
-                sample()
-            taken.append((time.perf_counter() - begin) / STEPS_PER_SAMPLE)
-    return [statistics.median(taken) for taken in times]
-
-
 def measure() -> list[Row]:
     """Measure both ratios."""
     torch.set_num_threads(1)
     actions = torch.rand(NUM_ENVS, 1, generator=torch.Generator().manual_seed(0)) * 2 - 1
     env = make_env(num_threads=2)
-    bare = bare_sample(env.sim.mj_model, env.cfg.decimation, actions, num_threads=2)
-    env_time, bare_time = alternate(env_sample(env, actions), bare)
+    bare = BareLoop(env.sim.mj_model, NUM_ENVS, num_threads=2, decimation=env.cfg.decimation)
+    bare.qpos[:, 1] = np.pi
+    bare.ctrl[:] = actions.numpy()
+
+    def stepping(env: ManagerBasedRlEnv) -> Sample:
+        return lambda: env.step(actions)
+
+    env_time, bare_time = alternate(stepping(env), bare)
     # A task that reads derived quantities makes the native engine run the forward as well.
     reading = make_env(num_threads=2)
     _ = reading.sim.data.xpos
-    reading_time, bare_again = alternate(env_sample(reading, actions), bare)
+    reading_time, bare_again = alternate(stepping(reading), bare)
     one, two = make_env(num_threads=1), env
-    one_time, two_time = alternate(env_sample(one, actions), env_sample(two, actions))
+    one_time, two_time = alternate(stepping(one), stepping(two))
     over_bare, over_one = bare_time / env_time, one_time / two_time
     over_bare_reading = bare_again / reading_time
     return [

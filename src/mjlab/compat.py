@@ -43,10 +43,16 @@ _XML_ACTUATORS = {
 _DELAYED_ACTUATORS = {
     name: f"mjlab.actuator.older:{name}" for name in ("DelayedActuator", "DelayedActuatorCfg")
 }
+_REWARD_WEIGHT = {
+    name: f"mjlab.envs.mdp.older_curriculums:{name}"
+    for name in ("RewardWeightStage", "reward_weight")
+}
+_FLAT_ORIENTATION = {"flat_orientation": "mjlab.tasks.velocity.mdp.older:flat_orientation"}
 _TERRAIN_IMPORTER = {
     "TerrainImporter": "mjlab.terrains.terrain_entity:TerrainEntity",
     "TerrainImporterCfg": "mjlab.terrains.terrain_entity:TerrainEntityCfg",
 }
+_ROBOT_FILES = {"get_assets": "mjlab.compat:get_assets"}
 _VISER = {
     name: f"mjviser.conversions:{name}"
     for name in (
@@ -69,10 +75,15 @@ _NAMES: dict[str, dict[str, str]] = {
     "mjlab.actuator": {**_XML_ACTUATORS, **_DELAYED_ACTUATORS},
     "mjlab.actuator.xml_actuator": _XML_ACTUATORS,
     "mjlab.actuator.delayed_actuator": _DELAYED_ACTUATORS,
+    "mjlab.asset_zoo.robots.unitree_g1.g1_constants": _ROBOT_FILES,
+    "mjlab.asset_zoo.robots.unitree_go1.go1_constants": _ROBOT_FILES,
     "mjlab.envs.mdp": _EVENTS,
     "mjlab.envs.mdp.events": _EVENTS,
     "mjlab.envs.mdp.dr": {"sync_actuator_delays": _EVENTS["sync_actuator_delays"]},
     "mjlab.envs.mdp.dr.actuator": {"sync_actuator_delays": _EVENTS["sync_actuator_delays"]},
+    "mjlab.tasks.velocity.mdp": {**_EVENTS, **_REWARD_WEIGHT, **_FLAT_ORIENTATION},
+    "mjlab.tasks.velocity.mdp.curriculums": _REWARD_WEIGHT,
+    "mjlab.tasks.velocity.mdp.rewards": _FLAT_ORIENTATION,
     "mjlab.terrains": _TERRAIN_IMPORTER,
     "mjlab.terrains.terrain_importer": _TERRAIN_IMPORTER,
     "mjlab.utils.os": {"update_assets": "mjlab.compat:update_assets"},
@@ -223,6 +234,11 @@ def update_assets(
     for file in folder.rglob(glob) if recursive else folder.glob(glob):
         if file.is_file():
             assets[f"{meshdir}/{file.name}" if meshdir else file.name] = file.read_bytes()
+
+
+def get_assets(meshdir: str) -> dict[str, bytes]:
+    """Return the mesh files of a robot by path: none, as ours are drawn with primitive shapes."""
+    return {}
 
 
 def set_array_field(field: Any, values: Any) -> None:

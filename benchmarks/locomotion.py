@@ -1,0 +1,98 @@
+"""Speed of the velocity tasks: `env.step` over a bare `mjbatch` loop of the same model."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from report import Row, show
+from timing import BareLoop, alternate
+
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.tasks.registry import load_env_cfg
+
+NUM_ENVS = 1024
+NUM_THREADS = 2
+ACTION_SIZE = 0.3
+STEPS_BEFORE = 25
+
+
+@dataclass(frozen=True)
+class Case:
+    """A task and the ratio to reach on it."""
+
+    task: str
+    what: str
+    to_reach: float
+    with_rays: bool = False
+
+
+CASES = (
+    Case("Mjlab-Velocity-Flat-Unitree-Go1", "Go1 flat", 0.80),
+    Case("Mjlab-Velocity-Flat-Unitree-G1", "G1 flat", 0.85),
+    Case("Mjlab-Velocity-Rough-Unitree-Go1", "Go1 rough with its height scan", 0.75, True),
+)
+
+
+def make_env(task: str, num_envs: int) -> ManagerBasedRlEnv:
+    """Return the task's environments, standing on the ground."""
+    cfg = load_env_cfg(task)
+    cfg.scene.num_envs = num_envs
+    cfg.sim.num_threads = NUM_THREADS
+    cfg.sim.engine = "native"
+    cfg.seed = 1
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    env.reset()
+    return env
+
+
+def recorded_rays(env: ManagerBasedRlEnv) -> list[tuple[Any, ...]]:
+    """Return the arguments of all ray casts of one step."""
+    calls: list[tuple[Any, ...]] = []
+    engine: Any = env.sim._engine
+    original = engine.raycast
+    engine.raycast = lambda *args: calls.append(args) or original(*args)
+    env.sim.sense()
+    engine.raycast = original
+    return calls
+
+
+def measure_case(case: Case) -> Row:
+    """Measure one task. Both loops start from the same states and get the same controls."""
+    env = make_env(case.task, NUM_ENVS)
+    generator = torch.Generator().manual_seed(0)
+    shape = (NUM_ENVS, env.action_manager.total_action_dim)
+    actions = ACTION_SIZE * torch.randn(shape, generator=generator)
+    for _ in range(STEPS_BEFORE):
+        env.step(actions)
+    bare = BareLoop(env.sim.mj_model, NUM_ENVS, NUM_THREADS, env.cfg.decimation)
+    for name in ("qpos", "qvel", "ctrl"):
+        getattr(bare, name)[:] = getattr(env.sim.data, name).numpy()
+    if case.with_rays:
+        for origins, directions, groups, _ in recorded_rays(env):
+            bare.cast(origins.numpy(), directions.numpy(), tuple(groups or range(6)))
+    env_time, bare_time = alternate(lambda: env.step(actions), bare, steps=5, repeats=15)
+    ratio = bare_time / env_time
+    rays = ", same rays" if case.with_rays else ""
+    return Row(
+        f"{case.what}, {NUM_ENVS} envs, native, {NUM_THREADS} threads: `env.step` over the bare "
+        f"loop{rays}",
+        f"{ratio:.2f} ({NUM_ENVS / env_time:,.0f} env-steps/s)",
+        f"bare `mjbatch` loop: {NUM_ENVS / bare_time:,.0f} env-steps/s",
+        f"at least {case.to_reach:.2f}",
+        ratio >= case.to_reach,
+    )
+
+
+def measure(keyword: str = "") -> list[Row]:
+    """Measure every task whose name contains `keyword`."""
+    torch.set_num_threads(1)
+    return [measure_case(case) for case in CASES if keyword in case.task]
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("keyword", nargs="?", default="", help="part of a task's name")
+    print(show(measure(parser.parse_args().keyword)))

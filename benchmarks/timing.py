@@ -1,0 +1,68 @@
+"""Timing that several things take turns in, and the bare `mjbatch` loop they are compared with."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import mjbatch
+import mujoco
+import numpy as np
+
+Sample = Callable[[], Any]
+
+
+def alternate(
+    *samples: Sample, steps: int = 20, repeats: int = 15, warm_up: int = 5
+) -> list[float]:
+    """Return the median time of each sample, in seconds, taking turns so that noise hits all."""
+    for sample in samples:
+        for _ in range(warm_up):
+            sample()
+    times: list[list[float]] = [[] for _ in samples]
+    for _ in range(repeats):
+        for sample, taken in zip(samples, times, strict=True):
+            begin = time.perf_counter()
+            for _ in range(steps):
+                sample()
+            taken.append((time.perf_counter() - begin) / steps)
+    return [statistics.median(taken) for taken in times]
+
+
+class BareLoop:
+    """The physics of one environment step on `mjbatch`, and nothing else.
+
+    State goes in and out as double-precision views, which cost `mjbatch` nothing, and no derived
+    quantity is copied out.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, num_envs: int, num_threads: int, decimation: int
+    ) -> None:
+        self._batch = mjbatch.Batch(model, num_envs, num_threads)
+        self._decimation = decimation
+        self.qpos, self.ctrl = self._batch.bind("qpos"), self._batch.bind("ctrl")
+        self.qvel = self._batch.bind("qvel")
+        self._rays: list[dict[str, np.ndarray]] = []
+
+    def cast(self, origins: np.ndarray, directions: np.ndarray, groups: tuple[int, ...]) -> None:
+        """Cast these rays (num_envs, R, 3), in geoms of these groups, at the end of every step."""
+        mask = np.zeros(6, dtype=np.uint8)
+        mask[list(groups)] = 1
+        self._rays.append(
+            {
+                "pnt": np.ascontiguousarray(origins, dtype=np.float64),
+                "vec": np.ascontiguousarray(directions, dtype=np.float64),
+                "dist": np.empty(origins.shape[:2]),
+                "normal": np.empty(origins.shape),
+                "geomgroup": mask,
+            }
+        )
+
+    def __call__(self) -> None:
+        self._batch.step(nstep=self._decimation)
+        self._batch.forward()
+        for rays in self._rays:
+            self._batch.rays(**rays)

@@ -1,0 +1,1 @@
+"""Robots that come with the library, ready to be put into a scene."""

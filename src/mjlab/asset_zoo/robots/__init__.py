@@ -1,0 +1,27 @@
+"""Configs of the robots that come with the library.
+
+The names are loaded on first use, so that a task pays for its own robot alone.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mjlab.utils.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from mjlab.asset_zoo.robots.unitree_g1.g1_constants import (
+        get_g1_robot_cfg as get_g1_robot_cfg,
+    )
+    from mjlab.asset_zoo.robots.unitree_go1.go1_constants import (
+        get_go1_robot_cfg as get_go1_robot_cfg,
+    )
+
+_HOMES = {
+    "get_g1_robot_cfg": "mjlab.asset_zoo.robots.unitree_g1.g1_constants",
+    "get_go1_robot_cfg": "mjlab.asset_zoo.robots.unitree_go1.go1_constants",
+}
+
+__all__ = sorted(_HOMES)
+
+__getattr__ = lazy_names(__name__, _HOMES)

@@ -1,0 +1,248 @@
+"""The Unitree G1: its motors, gains, poses and collision setups.
+
+Each joint is a position actuator, that is a spring and a damper towards the commanded angle. The
+gains follow from the inertia I that the motor has at the joint (that of its rotor and of its two
+planetary stages), as if the joint carried nothing else:
+
+    stiffness = I w^2,  damping = 2 z I w,
+
+with the natural frequency w (`NATURAL_FREQ`) and the damping ratio z (`DAMPING_RATIO`). Four kinds
+of motor move the 29 joints; they are called after their size, "7520-14" being the 7520 whose gears
+give about 14:1. Torques are in N m, angles in rad, lengths in m, inertias in kg m^2.
+"""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import mujoco
+
+from mjlab.actuator import BuiltinPositionActuatorCfg
+from mjlab.compat import older_names
+from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
+from mjlab.utils.actuator import ElectricActuator, reflected_inertia_from_two_stage_planetary
+from mjlab.utils.spec_config import CollisionCfg
+
+# The model.
+
+G1_XML = Path(__file__).parent / "xmls" / "g1.xml"
+
+
+def get_spec() -> mujoco.MjSpec:
+    """Return a new spec of the robot, without actuators: the config adds them."""
+    return mujoco.MjSpec.from_file(str(G1_XML))
+
+
+# Motors: the inertias of rotor, first and second stage, and the ratios of the stages. A stage whose
+# planets run between a sun of s teeth and a ring of r teeth has the ratio 1 + r/s.
+
+ROTOR_INERTIAS_5020 = (0.139e-4, 0.017e-4, 0.169e-4)
+GEARS_5020 = (1, 1 + (46 / 18), 1 + (56 / 16))
+ARMATURE_5020 = reflected_inertia_from_two_stage_planetary(ROTOR_INERTIAS_5020, GEARS_5020)
+
+ROTOR_INERTIAS_7520_14 = (0.489e-4, 0.098e-4, 0.533e-4)
+GEARS_7520_14 = (1, 4.5, 1 + (48 / 22))
+ARMATURE_7520_14 = reflected_inertia_from_two_stage_planetary(ROTOR_INERTIAS_7520_14, GEARS_7520_14)
+
+ROTOR_INERTIAS_7520_22 = (0.489e-4, 0.109e-4, 0.738e-4)
+GEARS_7520_22 = (1, 4.5, 5)
+ARMATURE_7520_22 = reflected_inertia_from_two_stage_planetary(ROTOR_INERTIAS_7520_22, GEARS_7520_22)
+
+ROTOR_INERTIAS_4010 = (0.068e-4, 0.0, 0.0)
+GEARS_4010 = (1, 5, 5)
+ARMATURE_4010 = reflected_inertia_from_two_stage_planetary(ROTOR_INERTIAS_4010, GEARS_4010)
+
+ACTUATOR_5020 = ElectricActuator(
+    reflected_inertia=ARMATURE_5020, velocity_limit=37.0, effort_limit=25.0
+)
+"""Moves the shoulders, the elbow and the roll of the wrist; two of them move the ankle, and two
+the pitch and roll of the waist."""
+ACTUATOR_7520_14 = ElectricActuator(
+    reflected_inertia=ARMATURE_7520_14, velocity_limit=32.0, effort_limit=88.0
+)
+"""Moves the pitch and yaw of the hip and the yaw of the waist."""
+ACTUATOR_7520_22 = ElectricActuator(
+    reflected_inertia=ARMATURE_7520_22, velocity_limit=20.0, effort_limit=139.0
+)
+"""Moves the roll of the hip and the knee."""
+ACTUATOR_4010 = ElectricActuator(
+    reflected_inertia=ARMATURE_4010, velocity_limit=22.0, effort_limit=5.0
+)
+"""Moves the pitch and yaw of the wrist."""
+
+# Gains.
+
+NATURAL_FREQ = 10 * 2.0 * 3.1415926535
+"""Natural frequency of the joints, 10 Hz in rad/s. (Policies are trained with pi as it is here.)"""
+DAMPING_RATIO = 2.0
+"""Damping ratio of the joints; more than 1 creeps towards the target and never overshoots."""
+
+STIFFNESS_5020 = ARMATURE_5020 * NATURAL_FREQ**2
+STIFFNESS_7520_14 = ARMATURE_7520_14 * NATURAL_FREQ**2
+STIFFNESS_7520_22 = ARMATURE_7520_22 * NATURAL_FREQ**2
+STIFFNESS_4010 = ARMATURE_4010 * NATURAL_FREQ**2
+
+DAMPING_5020 = 2.0 * DAMPING_RATIO * ARMATURE_5020 * NATURAL_FREQ
+DAMPING_7520_14 = 2.0 * DAMPING_RATIO * ARMATURE_7520_14 * NATURAL_FREQ
+DAMPING_7520_22 = 2.0 * DAMPING_RATIO * ARMATURE_7520_22 * NATURAL_FREQ
+DAMPING_4010 = 2.0 * DAMPING_RATIO * ARMATURE_4010 * NATURAL_FREQ
+
+G1_ACTUATOR_5020 = BuiltinPositionActuatorCfg(
+    target_names_expr=(
+        ".*_elbow_joint",
+        ".*_shoulder_pitch_joint",
+        ".*_shoulder_roll_joint",
+        ".*_shoulder_yaw_joint",
+        ".*_wrist_roll_joint",
+    ),
+    stiffness=STIFFNESS_5020,
+    damping=DAMPING_5020,
+    effort_limit=ACTUATOR_5020.effort_limit,
+    armature=ACTUATOR_5020.reflected_inertia,
+)
+G1_ACTUATOR_7520_14 = BuiltinPositionActuatorCfg(
+    target_names_expr=(".*_hip_pitch_joint", ".*_hip_yaw_joint", "waist_yaw_joint"),
+    stiffness=STIFFNESS_7520_14,
+    damping=DAMPING_7520_14,
+    effort_limit=ACTUATOR_7520_14.effort_limit,
+    armature=ACTUATOR_7520_14.reflected_inertia,
+)
+G1_ACTUATOR_7520_22 = BuiltinPositionActuatorCfg(
+    target_names_expr=(".*_hip_roll_joint", ".*_knee_joint"),
+    stiffness=STIFFNESS_7520_22,
+    damping=DAMPING_7520_22,
+    effort_limit=ACTUATOR_7520_22.effort_limit,
+    armature=ACTUATOR_7520_22.reflected_inertia,
+)
+G1_ACTUATOR_4010 = BuiltinPositionActuatorCfg(
+    target_names_expr=(".*_wrist_pitch_joint", ".*_wrist_yaw_joint"),
+    stiffness=STIFFNESS_4010,
+    damping=DAMPING_4010,
+    effort_limit=ACTUATOR_4010.effort_limit,
+    armature=ACTUATOR_4010.reflected_inertia,
+)
+
+# Waist and ankle are four-bar linkages: two 5020 side by side move pitch when they turn together
+# and roll when they turn against each other. The model has a serial chain instead. At the nominal
+# pose each of its two joints sees both motors, hence twice the inertia, gains and torque; away from
+# it the true figures depend on the angles.
+_PARALLEL_MOTORS = 2
+
+G1_ACTUATOR_WAIST = BuiltinPositionActuatorCfg(
+    target_names_expr=("waist_pitch_joint", "waist_roll_joint"),
+    stiffness=STIFFNESS_5020 * _PARALLEL_MOTORS,
+    damping=DAMPING_5020 * _PARALLEL_MOTORS,
+    effort_limit=ACTUATOR_5020.effort_limit * _PARALLEL_MOTORS,
+    armature=ACTUATOR_5020.reflected_inertia * _PARALLEL_MOTORS,
+)
+G1_ACTUATOR_ANKLE = BuiltinPositionActuatorCfg(
+    target_names_expr=(".*_ankle_pitch_joint", ".*_ankle_roll_joint"),
+    stiffness=STIFFNESS_5020 * _PARALLEL_MOTORS,
+    damping=DAMPING_5020 * _PARALLEL_MOTORS,
+    effort_limit=ACTUATOR_5020.effort_limit * _PARALLEL_MOTORS,
+    armature=ACTUATOR_5020.reflected_inertia * _PARALLEL_MOTORS,
+)
+
+_ACTUATORS = (
+    G1_ACTUATOR_5020,
+    G1_ACTUATOR_7520_14,
+    G1_ACTUATOR_7520_22,
+    G1_ACTUATOR_4010,
+    G1_ACTUATOR_WAIST,
+    G1_ACTUATOR_ANKLE,
+)
+G1_ARTICULATION = EntityArticulationInfoCfg(actuators=_ACTUATORS, soft_joint_pos_limit_factor=0.9)
+"""All actuators."""
+
+# An action of one is a quarter of the angle at which the spring alone gives the effort limit.
+_ACTION_EFFORT_SHARE = 0.25
+G1_ACTION_SCALE: dict[str, float] = {
+    pattern: _ACTION_EFFORT_SHARE * actuator.effort_limit / actuator.stiffness
+    for actuator in _ACTUATORS
+    if actuator.effort_limit is not None
+    for pattern in actuator.target_names_expr
+}
+"""Scale of joint position actions by joint pattern, rad per unit of action."""
+
+# Keyframes.
+
+HOME_KEYFRAME = EntityCfg.InitialStateCfg(
+    pos=(0, 0, 0.783675),
+    joint_pos={
+        ".*_hip_pitch_joint": -0.1,
+        ".*_knee_joint": 0.3,
+        ".*_ankle_pitch_joint": -0.2,
+        ".*_shoulder_pitch_joint": 0.2,
+        ".*_elbow_joint": 1.28,
+        "left_shoulder_roll_joint": 0.2,
+        "right_shoulder_roll_joint": -0.2,
+    },
+    joint_vel={".*": 0.0},
+)
+"""Standing nearly upright, the forearms level."""
+KNEES_BENT_KEYFRAME = EntityCfg.InitialStateCfg(
+    pos=(0, 0, 0.76),
+    joint_pos={
+        ".*_hip_pitch_joint": -0.312,
+        ".*_knee_joint": 0.669,
+        ".*_ankle_pitch_joint": -0.363,
+        ".*_elbow_joint": 0.6,
+        "left_shoulder_roll_joint": 0.2,
+        "left_shoulder_pitch_joint": 0.2,
+        "right_shoulder_roll_joint": -0.2,
+        "right_shoulder_pitch_joint": 0.2,
+    },
+    joint_vel={".*": 0.0},
+)
+"""Standing with bent knees, ready to walk."""
+
+# Collision setups.
+
+_FOOT_REGEX = r"^(left|right)_foot[1-7]_collision$"
+
+FULL_COLLISION = CollisionCfg(
+    geom_names_expr=(".*_collision",),
+    contype=1,
+    conaffinity=1,
+    condim={_FOOT_REGEX: 3, ".*_collision": 1},
+    priority={_FOOT_REGEX: 1, ".*": 0},
+    friction={_FOOT_REGEX: (0.6,)},
+)
+"""Everything collides, self-collisions included. Only feet have friction."""
+FULL_COLLISION_WITHOUT_SELF = CollisionCfg(
+    geom_names_expr=(".*_collision",),
+    contype=0,
+    conaffinity=1,
+    condim={_FOOT_REGEX: 3, ".*_collision": 1},
+    priority={_FOOT_REGEX: 1, ".*": 0},
+    friction={_FOOT_REGEX: (0.6,)},
+)
+"""Everything collides, but only with other things."""
+FEET_ONLY_COLLISION = CollisionCfg(
+    geom_names_expr=(_FOOT_REGEX,),
+    contype=0,
+    conaffinity=1,
+    condim=3,
+    priority=1,
+    friction=(0.6,),
+)
+"""Only feet collide, and only with other things."""
+
+# The robot.
+
+
+def get_g1_robot_cfg() -> EntityCfg:
+    """Return a new config of the robot, its knees bent, with full collisions.
+
+    It shares nothing with the constants of this module: what a task changes in it stays there.
+    """
+    return EntityCfg(
+        init_state=copy.deepcopy(KNEES_BENT_KEYFRAME),
+        collisions=(copy.deepcopy(FULL_COLLISION),),
+        spec_fn=get_spec,
+        articulation=copy.deepcopy(G1_ARTICULATION),
+    )
+
+
+__getattr__ = older_names(__name__)

@@ -1,0 +1,253 @@
+"""The Unitree Go1 has the figures of its tables, stands, and is drawn without changing a thing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from robot_drawing import drawing_differences
+from robot_figures import VISUAL_GROUP, differences, load_table
+
+import mjlab
+from mjlab import compat
+from mjlab.asset_zoo.robots import get_go1_robot_cfg
+from mjlab.asset_zoo.robots.unitree_go1 import go1_constants as go1
+from mjlab.entity import Entity
+from mjlab.scene import Scene, SceneCfg
+from mjlab.sim import MujocoCfg, Simulation, SimulationCfg
+from mjlab.terrains import TerrainEntityCfg
+
+TABLE = load_table("unitree_go1")
+FEET = [f"{leg}_foot_collision" for leg in ("FR", "FL", "RR", "RL")]
+# The settings of the velocity tasks.
+MUJOCO = MujocoCfg(timestep=0.005, impratio=10, cone="elliptic", iterations=10, ls_iterations=20)
+
+
+def built(**changes) -> mujoco.MjModel:
+    cfg = get_go1_robot_cfg()
+    for field, value in changes.items():
+        setattr(cfg, field, value)
+    return cfg.build().spec.compile()
+
+
+def test_every_figure_is_that_of_the_table():
+    assert differences(go1.get_spec(), TABLE) == []
+
+
+def test_every_body_is_drawn_about_as_large_as_in_the_table():
+    assert drawing_differences(go1.get_spec(), TABLE) == []
+
+
+def test_the_light_and_the_cameras_follow_the_centre_of_mass():
+    model = go1.get_spec().compile()
+    follow = mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
+    assert model.cam_mode.tolist() == [follow] * 4
+    assert model.light_mode.tolist() == [follow]
+    light = model.light(0)
+    assert light.type[0] == mujoco.mjtLightType.mjLIGHT_SPOT
+    np.testing.assert_allclose(light.pos, [0, 0, 2])
+    np.testing.assert_allclose(light.dir, [0, 0, -1])
+    np.testing.assert_allclose(light.diffuse, 0.7)
+    np.testing.assert_allclose(light.specular, 0.3)
+    np.testing.assert_allclose(light.ambient, 0.0)
+    assert (light.cutoff[0], light.exponent[0]) == (45, 10)
+
+
+# The config, with the numbers of the task tables.
+
+
+def test_motors_and_gains_are_those_of_the_task_tables():
+    hip, knee = get_go1_robot_cfg().articulation.actuators
+    found = {
+        cfg.target_names_expr: (cfg.armature, cfg.stiffness, cfg.damping, cfg.effort_limit)
+        for cfg in (hip, knee)
+    }
+    assert found == {
+        (".*_hip_joint", ".*_thigh_joint"): pytest.approx(
+            (0.004026312, 15.89524265, 1.011922576, 23.7), rel=1e-9
+        ),
+        (".*_calf_joint",): pytest.approx((0.009059202, 35.76429597, 2.276825796, 35.55), rel=1e-9),
+    }
+    assert go1.HIP_ACTUATOR.velocity_limit == 30.1
+    assert go1.KNEE_ACTUATOR.velocity_limit == 20.06
+    assert get_go1_robot_cfg().articulation.soft_joint_pos_limit_factor == 0.9
+
+
+def test_the_compiled_joints_have_these_gains():
+    model = built()
+    for index in range(model.nu):
+        joint = model.joint(model.actuator(index).trnid[0])
+        knee = "calf" in joint.name
+        stiffness, damping, armature, effort = (
+            (35.76429597, 2.276825796, 0.009059202, 35.55)
+            if knee
+            else (15.89524265, 1.011922576, 0.004026312, 23.7)
+        )
+        assert model.actuator_gainprm[index, 0] == pytest.approx(stiffness)
+        assert model.actuator_biasprm[index, :3] == pytest.approx([0, -stiffness, -damping])
+        assert model.actuator_forcerange[index] == pytest.approx([-effort, effort])
+        assert model.dof_armature[joint.dofadr[0]] == pytest.approx(armature)
+    assert model.nu == 12
+
+
+def test_the_action_scale_is_that_of_the_task_tables():
+    scale = dict(go1.GO1_ACTION_SCALE)
+    assert scale.pop(".*_calf_joint") == pytest.approx(0.2485020258)
+    assert set(scale) == {".*_hip_joint", ".*_thigh_joint"}
+    assert list(scale.values()) == pytest.approx([0.3727530387] * 2)
+
+
+def test_the_home_pose_is_that_of_the_task_tables():
+    model = built()
+    qpos = model.key_qpos[0]
+    assert qpos[:7] == pytest.approx([0, 0, 0.278, 1, 0, 0, 0])
+    right, left = [0.1, 0.9, -1.8], [-0.1, 0.9, -1.8]
+    assert qpos[7:] == pytest.approx([*right, *left, *right, *left])
+    assert not model.key_qvel.any()
+
+
+def test_full_collisions_are_those_of_the_task_tables():
+    model = built()
+    for index in range(model.ngeom):
+        geom = model.geom(index)
+        felt, foot = "_collision" in geom.name, geom.name in FEET
+        assert (geom.contype[0], geom.conaffinity[0]) == ((1, 1) if felt else (0, 0))
+        assert geom.condim[0] == (6 if foot else 1 if felt else 3)
+        assert geom.priority[0] == (1 if foot else 0)
+        assert geom.friction == pytest.approx([1, 0.005, 0.0005] if foot else [1, 0.005, 0.0001])
+        assert geom.solref == pytest.approx([0.01, 1] if felt else [0.02, 1])
+        assert geom.solimp == pytest.approx([0.9, 0.95, 0.001, 0.5, 2])
+
+
+def test_feet_only_collisions_leave_nothing_but_the_feet():
+    model = built(collisions=(go1.FEET_ONLY_COLLISION,))
+    for index in range(model.ngeom):
+        geom = model.geom(index)
+        foot = geom.name in FEET
+        assert (geom.contype[0], geom.conaffinity[0]) == ((0, 1) if foot else (0, 0))
+        if foot:
+            assert (geom.condim[0], geom.priority[0], geom.friction[0]) == (3, 1, 0.6)
+            assert geom.solimp == pytest.approx([0.9, 0.95, 0.023, 0.5, 2])
+
+
+def test_a_config_that_a_task_changes_leaves_the_next_one_as_it_was():
+    changed = get_go1_robot_cfg()
+    changed.init_state.joint_pos[".*thigh_joint"] = 0.0
+    changed.articulation.actuators[0].stiffness = 1.0
+    changed.collisions[0].friction.clear()
+    assert get_go1_robot_cfg() == get_go1_robot_cfg()
+    assert get_go1_robot_cfg().init_state.joint_pos[".*thigh_joint"] == 0.9
+    assert get_go1_robot_cfg().articulation.actuators[0].stiffness == go1.STIFFNESS_HIP
+    assert get_go1_robot_cfg().collisions[0].friction
+
+
+# In the simulation.
+
+
+def scene_of(cfg, num_envs: int = 1) -> tuple[Scene, Simulation]:
+    scene = Scene(
+        SceneCfg(num_envs=num_envs, entities={"robot": cfg}, terrain=TerrainEntityCfg()),
+        device="cpu",
+    )
+    sim_cfg = SimulationCfg(engine="native", mujoco=MUJOCO)
+    sim = Simulation(num_envs, sim_cfg, model=scene.compile(), device="cpu")
+    scene.initialize(sim.mj_model, sim.model, sim.data)
+    return scene, sim
+
+
+def test_it_stands_for_two_seconds_at_its_home_pose():
+    scene, sim = scene_of(get_go1_robot_cfg(), num_envs=2)
+    robot: Entity = scene["robot"]
+    robot.set_joint_position_target(robot.data.default_joint_pos)
+    lift = torch.tensor([0.01, 0.05])
+    root = robot.data.default_root_state.clone()
+    # Where and how high resets of the velocity tasks put it.
+    root[:, :3] += scene.env_origins
+    root[:, 2] += lift
+    robot.write_root_state_to_sim(root)
+    robot.write_joint_state_to_sim(robot.data.default_joint_pos, robot.data.default_joint_vel)
+    scene.write_data_to_sim()
+    for step in range(400):
+        sim.step()
+        if step >= 100:
+            height = robot.data.root_link_pos_w[:, 2]
+            assert torch.all((height - 0.278).abs() < 0.035)
+    sim.forward()
+    assert torch.all(robot.data.projected_gravity_b[:, 2] < -0.99)
+    assert robot.data.root_link_lin_vel_w.norm(dim=-1).max() < 0.05
+
+
+def test_its_sensors_work_inside_a_scene():
+    scene, sim = scene_of(get_go1_robot_cfg())
+    model = sim.mj_model
+    assert [model.sensor(i).name for i in range(model.nsensor)] == [
+        f"robot/{sensor['name']}" for sensor in TABLE["sensors"]
+    ]
+    # A quarter turn to the left about x: the robot's y axis points up.
+    sim.data.qpos[:] = torch.tensor(model.key_qpos[0], dtype=torch.float32)
+    sim.data.qpos[0, 3:7] = torch.tensor([0.5**0.5, 0.5**0.5, 0, 0])
+    sim.forward()
+    address = model.sensor("robot/imu_upvector").adr[0]
+    up = sim.data.sensordata[0, address : address + 3]
+    torch.testing.assert_close(up, torch.tensor([0.0, 1.0, 0.0]), atol=1e-6, rtol=0)
+
+
+def test_what_is_drawn_changes_neither_masses_nor_contacts():
+    def without_drawing() -> mujoco.MjSpec:
+        spec = go1.get_spec()
+        for geom in list(spec.geoms):
+            if geom.group == VISUAL_GROUP:
+                spec.delete(geom)
+        return spec
+
+    bare = get_go1_robot_cfg()
+    bare.spec_fn = without_drawing
+    models = [scene_of(cfg)[1].mj_model for cfg in (get_go1_robot_cfg(), bare)]
+    assert models[0].ngeom > models[1].ngeom + 30
+    for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_invweight0"):
+        np.testing.assert_array_equal(getattr(models[0], field), getattr(models[1], field))
+    ends = []
+    for model in models:
+        # On its side, so that legs and body touch the ground and one another.
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+        data.qpos[3:7] = [0.5**0.5, 0.5**0.5, 0, 0]
+        mujoco.mj_step(model, data, nstep=200)
+        names = [
+            (model.geom(contact.geom1).name, model.geom(contact.geom2).name)
+            for contact in data.contact[: data.ncon]
+        ]
+        ends.append((names, data.qpos.copy()))
+    assert ends[0][0] == ends[1][0]
+    assert ends[0][0]
+    np.testing.assert_array_equal(ends[0][1], ends[1][1])
+
+
+# The package.
+
+
+def test_naming_a_robot_loads_nothing_until_it_is_used():
+    code = (
+        "import sys, mjlab.asset_zoo.robots as robots\n"
+        "assert 'get_go1_robot_cfg' in robots.__all__\n"
+        "heavy = {'torch', 'mujoco'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_model_lies_within_the_package():
+    assert go1.GO1_XML.is_file()
+    assert go1.GO1_XML.is_relative_to(Path(mjlab.__file__).parent)
+    assert (go1.GO1_XML.parents[1] / "README.md").read_text().count("BSD 3-Clause") == 1
+
+
+def test_its_older_loader_of_meshes_finds_none():
+    compat._warn_once.cache_clear()
+    with pytest.warns(FutureWarning, match="get_assets"):
+        assert go1.get_assets("assets") == {}
