@@ -180,7 +180,7 @@ HOME_KEYFRAME = EntityCfg.InitialStateCfg(
     },
     joint_vel={".*": 0.0},
 )
-"""Standing nearly upright, the forearms level."""
+"""Standing nearly upright, the arms hanging."""
 KNEES_BENT_KEYFRAME = EntityCfg.InitialStateCfg(
     pos=(0, 0, 0.76),
     joint_pos={
