@@ -47,7 +47,8 @@ def figures_of(value: Any) -> Any:
         return value.name
     if isinstance(value, Mapping):
         # A term that is None is switched off, which is the same as a term that is not there.
-        return {key: figures_of(item) for key, item in value.items() if item is not None}
+        # Tables have keys that are numbers as text.
+        return {str(key): figures_of(item) for key, item in value.items() if item is not None}
     if isinstance(value, (list, tuple)):
         return [figures_of(item) for item in value]
     if isinstance(value, (set, frozenset)):

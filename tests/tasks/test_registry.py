@@ -12,7 +12,9 @@ from mjlab.scripts.cli import run_command
 from mjlab.tasks import registry
 from mjlab.tasks.registry import (
     TaskImportError,
+    UnknownProfileError,
     UnknownTaskError,
+    list_profiles,
     list_tasks,
     load_env_cfg,
     load_rl_cfg,
@@ -79,6 +81,64 @@ def test_editing_what_was_registered_or_loaded_changes_nothing():
         loaded.scene.num_envs = 99
         assert load_env_cfg(name).decimation == 1
         assert load_env_cfg(name).scene.num_envs == 1
+
+
+def small(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
+    env_cfg.decimation += 5
+    rl_cfg.num_steps_per_env = 3
+
+
+def renamed(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
+    rl_cfg.experiment_name = "elsewhere"
+
+
+def test_a_profile_edits_copies_of_both_configs_also_of_those_to_play_with():
+    env, rl = env_cfg(1), RslRlOnPolicyRunnerCfg()
+    register_mjlab_task("Test", env, env_cfg(2), rl, None, {"cpu": small})
+    for _ in range(2):
+        assert load_env_cfg("Test", profile="cpu").decimation == 6
+        assert load_env_cfg("Test", True, "cpu").decimation == 7
+        assert load_rl_cfg("Test", profile="cpu").num_steps_per_env == 3
+    assert load_env_cfg("Test").decimation == env.decimation == 1
+    assert load_rl_cfg("Test") == rl == RslRlOnPolicyRunnerCfg()
+
+
+def test_profiles_are_listed_without_importing_them():
+    lazy = {"b": "no_such_module:cpu", "a": small}
+    register_mjlab_task("Test", env_cfg(), rl_cfg=RslRlOnPolicyRunnerCfg(), profiles=lazy)
+    assert list_profiles("Test") == ["a", "b"]
+    with pytest.raises(TaskImportError, match=r"'Test' .*'no_such_module:cpu'"):
+        load_rl_cfg("Test", profile="b")
+
+
+def test_a_profile_that_is_not_there_is_told_with_those_that_are():
+    rl = RslRlOnPolicyRunnerCfg()
+    register_mjlab_task("Two", env_cfg(), rl_cfg=rl, profiles={"cpu": small, "big": small})
+    register_mjlab_task("None", env_cfg(), rl_cfg=rl)
+    for load in (load_env_cfg, load_rl_cfg):
+        with pytest.raises(UnknownProfileError, match=r"no profile 'gpu'; .* are: big, cpu\."):
+            load("Two", profile="gpu")
+        with pytest.raises(UnknownProfileError, match="'None' has no profile 'cpu'; it has none"):
+            load("None", profile="cpu")
+
+
+@pytest.mark.parametrize(
+    ("profile", "message"),
+    [(renamed, "experiment_name .* has to stay 'exp1'"), (lambda env, rl: env, "return nothing")],
+)
+def test_a_profile_that_does_other_than_editing_is_refused(profile, message):
+    rl = RslRlOnPolicyRunnerCfg()
+    register_mjlab_task("Test", env_cfg(), rl_cfg=rl, profiles={"cpu": profile})
+    with pytest.raises(ValueError, match=f"'cpu' of task 'Test' .*{message}"):
+        load_env_cfg("Test", profile="cpu")
+
+
+@pytest.mark.parametrize("name", ["", "two words", "None", "--cpu="])
+def test_a_profiles_name_is_one_word(name):
+    with pytest.raises(ValueError, match="one word"):
+        register_mjlab_task(
+            "Test", env_cfg(), rl_cfg=RslRlOnPolicyRunnerCfg(), profiles={name: small}
+        )
 
 
 def test_a_task_without_a_learner_is_refused():

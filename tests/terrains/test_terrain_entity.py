@@ -8,11 +8,19 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mjlab.terrains import TerrainEntity, TerrainEntityCfg
+from mjlab.scene import Scene, SceneCfg
+from mjlab.terrains import (
+    FlatPatchSamplingCfg,
+    TerrainEntity,
+    TerrainEntityCfg,
+    TerrainGeneratorCfg,
+)
+from mjlab.terrains.config import flat, hf_pyramid_slope, pyramid_stairs
 from mjlab.terrains.origins import assign_columns, grid_origins, split_by_proportion
+from mjlab.utils.state import capture_state, restore_state, shape_differences
 
 
 def terrain(**fields) -> TerrainEntity:
@@ -73,8 +81,10 @@ def test_configs_that_make_no_sense_are_refused():
         terrain(terrain_type="hills")
     with pytest.raises(ValueError, match="env_spacing is None"):
         terrain(env_spacing=None)
-    with pytest.raises(ValueError, match="'generator' is not available"):
+    with pytest.raises(ValueError, match="'generator', but terrain_generator is None"):
         terrain(terrain_type="generator")
+    with pytest.raises(ValueError, match="max_init_terrain_level is -1; it must be 0 or more"):
+        terrain(max_init_terrain_level=-1)
     with pytest.raises(TypeError, match=r"TerrainEntity\(cfg, device\)"):
         TerrainEntityCfg().build()
 
@@ -213,3 +223,143 @@ def test_randomized_origins_cover_all_cells_and_spare_other_environments():
 def test_origins_of_another_shape_are_refused(shape):
     with pytest.raises(ValueError, match="must be \\(levels, columns, 3\\)"):
         terrain().configure_env_origins(torch.zeros(shape))
+
+
+# A generated terrain, as an entity.
+
+PATCHES = {"spawn": FlatPatchSamplingCfg(num_patches=3, patch_radius=0.4)}
+
+
+def generated(num_envs: int = 50, *, entity: dict | None = None, **fields) -> TerrainEntity:
+    given = {
+        "seed": 1,
+        "curriculum": True,
+        "size": (8.0, 8.0),
+        "num_rows": 4,
+        "sub_terrains": {
+            "flat": flat(proportion=0.7),
+            "stairs": pyramid_stairs(proportion=0.1),
+            "slope": hf_pyramid_slope(proportion=0.2, flat_patch_sampling=PATCHES),
+        },
+    }
+    return terrain(
+        num_envs=num_envs,
+        terrain_type="generator",
+        terrain_generator=TerrainGeneratorCfg(**(given | fields)),
+        **(entity or {}),
+    )
+
+
+def test_environments_start_on_the_cells_of_their_level_and_column():
+    entity = generated(entity={"max_init_terrain_level": 2})
+    assert entity.terrain_origins.shape == (4, 3, 3)
+    assert entity.max_terrain_level == 4
+    assert entity.terrain_generator.num_cols == 3
+    assert set(entity.terrain_levels.tolist()) == {0, 1, 2}
+    expected = entity.terrain_origins[entity.terrain_levels, entity.terrain_types]
+    assert torch.equal(entity.env_origins, expected)
+    # The stairs of row r are as high as its difficulty, and its spawn point is on top.
+    heights = entity.terrain_origins[:, 1, 2]
+    torch.testing.assert_close(heights, torch.tensor([0.0, 0.4, 0.8, 1.2]))
+
+
+def test_a_generated_terrain_is_one_static_body_without_the_material_of_the_plane(recwarn, caplog):
+    entity = generated()
+    assert not recwarn.list, "no word about a plane that is not there"
+    assert not caplog.messages
+    model = entity.compile()
+    assert entity.body_names == ("terrain",)
+    assert (model.nbody, model.nmocap) == (2, 0)
+    ground = model.mat("groundplane").id
+    assert not (model.geom_matid == ground).any()
+    assert model.light("sun").type[0] == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+
+
+def test_shares_of_environments_follow_proportions_in_a_curriculum_only():
+    """In a random grid with as many columns as kinds, columns do not hold one kind each."""
+    counts = torch.bincount(generated(100).terrain_types).tolist()
+    assert counts == split_by_proportion(100, np.array([0.7, 0.1, 0.2]))
+    random = generated(99, curriculum=False, num_cols=3)
+    assert torch.bincount(random.terrain_types).tolist() == [33, 33, 33]
+
+
+def test_flat_patches_are_tensors_of_every_cell():
+    entity = generated()
+    patches = entity.flat_patches["spawn"]
+    assert patches.shape == (4, 3, 3, 3)
+    assert patches.dtype == torch.float32
+    assert entity.flat_patch_radii == {"spawn": 0.4}
+    for col in (0, 1):
+        expected = entity.terrain_origins[:, col, None].expand(-1, 3, -1)
+        torch.testing.assert_close(patches[:, col], expected)
+    # Those of the slope are in their own cells.
+    middle = entity.terrain_origins[:, 2, None, :2]
+    assert ((patches[:, 2, :, :2] - middle).abs() <= 4.0).all()
+    assert (patches[:, 2, 0] != entity.terrain_origins[:, 2]).any()
+
+
+def test_debug_sites_show_spawn_points_and_flat_patches():
+    entity = generated(3, entity={"debug_vis": True})
+    model = entity.compile()
+    assert model.nsite == 3 + 12 + 4 * 3 * 3
+    site = model.site("terrain_origin_3_1")
+    assert site.pos.tolist() == pytest.approx(entity.terrain_origins[3, 1].tolist())
+    assert (site.size[0], site.group[0]) == (0.5, 5)
+    site = model.site("flat_patch_spawn_2_2_1")
+    assert site.pos.tolist() == pytest.approx(entity.flat_patches["spawn"][2, 2, 1].tolist())
+    assert site.size.tolist() == pytest.approx([0.4, 0.4, 0.02])
+    assert (site.type[0], site.group[0]) == (mujoco.mjtGeom.mjGEOM_BOX, 3)
+
+
+@given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=12))
+@settings(max_examples=30)
+def test_levels_move_by_one_and_only_those_that_pass_the_top_jump(moves):
+    entity = terrain(num_envs=6)
+    entity.configure_env_origins(grid(3, 2))
+    for up, down in moves:
+        before = entity.terrain_levels.clone()
+        entity.update_env_origins(torch.arange(6), *(torch.tensor([x] * 6) for x in (up, down)))
+        after, step = entity.terrain_levels, int(up) - int(down)
+        expected = (before + step).clamp(min=0)
+        stays_on = before + step < 3
+        assert torch.equal(after[stays_on], expected[stays_on])
+        assert ((after >= 0) & (after < 3)).all()
+        origins = entity.terrain_origins[after, entity.terrain_types]
+        assert torch.equal(entity.env_origins, origins)
+
+
+def test_a_reset_without_moves_leaves_levels_where_they_started():
+    entity = generated(entity={"max_init_terrain_level": 1})
+    levels, origins = entity.terrain_levels.clone(), entity.env_origins.clone()
+    none = torch.zeros(50, dtype=torch.bool)
+    entity.update_env_origins(torch.arange(50), none, none)
+    assert torch.equal(entity.terrain_levels, levels)
+    assert torch.equal(entity.env_origins, origins)
+
+
+def test_levels_and_columns_are_part_of_a_checkpoint():
+    entity = generated()
+    entity.randomize_env_origins(torch.arange(50))
+    saved = capture_state(entity)
+    other = generated()
+    kept = other.env_origins
+    restore_state(other, saved)
+    for name in ("terrain_levels", "terrain_types", "env_origins"):
+        assert torch.equal(getattr(other, name), getattr(entity, name))
+    assert other.env_origins is kept, "terms may hold the tensor"
+    # A state of another grid is recognised.
+    assert shape_differences(saved, capture_state(generated(num_rows=3)))
+
+
+def test_a_scene_with_a_generated_terrain_leaves_its_config_alone():
+    cfg = TerrainEntityCfg(
+        terrain_type="generator",
+        terrain_generator=TerrainGeneratorCfg(
+            seed=0, size=(8.0, 8.0), num_rows=2, num_cols=2, sub_terrains={"a": pyramid_stairs()}
+        ),
+    )
+    scene = Scene(SceneCfg(num_envs=5, terrain=cfg), device="cpu")
+    assert scene.terrain.env_origins.shape == (5, 3)
+    assert (cfg.num_envs, cfg.env_spacing) == (1, 2.0)
+    assert cfg.terrain_generator.sub_terrains["a"].size == (10.0, 10.0)
+    assert scene.compile().body("terrain").geomnum[0] == 4 * 25

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from mjlab.utils.gpu import select_gpus
+from mjlab.utils.gpu import egl_device_id, select_gpus
 
 
 @pytest.fixture
@@ -54,3 +54,13 @@ def test_positions_out_of_range_are_refused_with_the_valid_ones(machine, visible
     machine(2, visible)
     with pytest.raises(ValueError, match=rf"\[{gpu_ids[-1]}\]: valid indices are \[0, 1\]"):
         select_gpus(gpu_ids)
+
+
+@pytest.mark.parametrize(
+    ("visible", "index", "expected"),
+    [(None, 1, 1), ("3", 0, 3), ("6,2", 1, 2), ("6,2", 2, None), ("MIG-a", 0, None), ("", 0, None)],
+)
+def test_rendering_goes_to_the_gpu_as_the_machine_numbers_it(machine, visible, index, expected):
+    """The defect: with GPU 3 alone visible, GPU 0 rendered."""
+    machine(4, visible)
+    assert egl_device_id(index) == expected

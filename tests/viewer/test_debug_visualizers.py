@@ -81,7 +81,27 @@ def test_arrows_without_a_length_are_skipped(viser_server) -> None:
     for target in (board, page):
         target.add_arrow(np.ones(3), np.ones(3), RED)
     assert board.scn.ngeom == 0
-    assert not page._batches
+    page.send(np.zeros(3))
+    assert not page._handles
+    page.add_arrow(np.zeros(3), np.ones(3), RED)
+    page.add_arrow(np.ones(3), np.ones(3), BLUE)
+    page.send(np.zeros(3))
+    assert len(page._handles["shaft"].batched_positions) == 1
+
+
+def test_browser_arrows_reach_from_start_to_end_whatever_their_direction(viser_server) -> None:
+    page = ViserDebugVisualizer(viser_server, MODEL)
+    ends = [np.array(end, dtype=float) for end in ((0, 0, 2), (0, 0, -2), (3, 0, 0), (1, -2, 2))]
+    start = np.array([1.0, 2.0, 3.0])
+    for end in ends:
+        page.add_arrow(start, start + end, RED, width=0.1)
+    page.send(np.zeros(3))
+    head = page._handles["head"]
+    for i, end in enumerate(ends):
+        axis = vtf.SO3(np.asarray(head.batched_wxyzs[i], dtype=float)).as_matrix()[:, 2]
+        tip = head.batched_positions[i] + head.batched_scales[i][2] * axis
+        np.testing.assert_allclose(tip, start + end, atol=1e-5)
+        np.testing.assert_allclose(head.batched_scales[i][:2], 0.2)
 
 
 def test_a_full_native_scene_is_said_once_and_breaks_nothing(caplog) -> None:

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import mujoco
 import torch
 
+from mjlab.managers.debug_vis import SensorSwitches
 from mjlab.viewer.viewer_config import ViewerConfig
 
 XML = """
@@ -101,6 +102,16 @@ class FakeTerms:
         return True
 
 
+class FakeSensor:
+    """A sensor that draws one sphere, or none."""
+
+    def __init__(self, draws: bool = True):
+        self.draws = draws
+
+    def debug_vis(self, visualizer) -> None:
+        visualizer.add_sphere([0, 0, 1], 0.05, (1.0, 1.0, 0.0, 1.0))
+
+
 class FakeEnv:
     """Two carts 3 m apart (in origin only); fails at steps listed in `fail_at`."""
 
@@ -125,6 +136,8 @@ class FakeEnv:
         self.reward_manager = FakeTerms({"upright": 0.5, "effort": -0.25})
         self.metrics_manager = FakeTerms({"height": 1.0})
         self.command_manager = FakeTerms({"velocity": 0.0})
+        self.manager_visualizers = {"command_manager": self.command_manager}
+        self.sensor_visualizers = SensorSwitches({"hits": FakeSensor(), "silent": FakeSensor(False)})
         self.metadata = {"render_fps": 50.0}
         self.num_steps = 0
         self.num_resets = 0
@@ -159,6 +172,7 @@ class FakeEnv:
         return self.get_observations(), {}
 
     def update_visualizers(self, visualizer) -> None:
+        self.sensor_visualizers.debug_vis(visualizer)
         for i in visualizer.get_env_indices(self.num_envs):
             cart = self.sim.datas[i].xpos[2]
             visualizer.add_arrow(cart, cart + [0, 0, 0.6], (0.1, 0.7, 0.2, 0.8), width=0.03)

@@ -72,6 +72,7 @@ def _check_fits(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
             f"The saved environment state is of the {state['sim']['engine']} engine; this run has "
             f"{env.sim.engine_name}. Resume with --engine {state['sim']['engine']}."
         )
+    _check_terrain(env, state["scene"])
     current = state_dict(env)
     differences = [
         f"{manager} had the terms {state['terms'].get(manager)} and has {current['terms'].get(manager)}"
@@ -83,6 +84,20 @@ def _check_fits(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
         more = f"; and {len(differences) - 5} more" if len(differences) > 5 else ""
         raise ValueError(
             "The task is not the one that was saved: " + "; ".join(differences[:5]) + more + "."
+        )
+
+
+def _check_terrain(env: ManagerBasedRlEnv, scene: dict[str, Any]) -> None:
+    """Raise ValueError if the saved environments stood on another generated terrain."""
+    terrain = env.scene.terrain
+    saved = scene.get("_terrain", {}).get("terrain_origins")
+    if terrain is None or terrain.terrain_origins is None or saved is None:
+        return
+    here = terrain.terrain_origins
+    if saved.shape != here.shape or not torch.equal(saved.to(here.device), here):
+        raise ValueError(
+            "The saved environments stand on another terrain than these. Terrain follows from the "
+            "seed: resume with the seed and the terrain settings of the run that saved them."
         )
 
 

@@ -28,6 +28,7 @@ from mjlab.managers import (
     RewardManager,
     TerminationManager,
 )
+from mjlab.managers.debug_vis import SensorSwitches
 from mjlab.scene import Scene
 from mjlab.sim.engine import resolve_engine_name
 from mjlab.sim.simulation import Simulation
@@ -97,6 +98,7 @@ class ManagerBasedRlEnv:
         self.metadata["render_fps"] = 1.0 / self.step_dt
         self.load_managers()
         self.setup_manager_visualizers()
+        self.sensor_visualizers = SensorSwitches(self.scene.sensors)
 
     # What there is.
 
@@ -427,10 +429,8 @@ class ManagerBasedRlEnv:
 
     def update_visualizers(self, visualizer: DebugVisualizer) -> None:
         """Let managers and sensors draw into `visualizer`."""
-        for manager in self.manager_visualizers.values():
-            manager.debug_vis(visualizer)
-        for sensor in self.scene.sensors.values():
-            sensor.debug_vis(visualizer)
+        for part in (*self.manager_visualizers.values(), self.sensor_visualizers):
+            part.debug_vis(visualizer)
 
     def state_dict(self) -> dict[str, Any]:
         """Return all run-time state, so that a run can resume bit for bit."""

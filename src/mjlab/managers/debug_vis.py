@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -69,3 +69,15 @@ class TermFunctionSwitches(DebugVisSwitches):
             for name, cfg in terms
             if callable(getattr(cfg.func, "debug_vis", None))
         ]
+
+
+class SensorSwitches(DebugVisSwitches):
+    """The same for the sensors of a scene."""
+
+    def __init__(self, sensors: Mapping[str, Any]) -> None:
+        """Take the sensors by name, as the scene has them."""
+        self._sensors = sensors
+
+    def get_visualizable_terms(self) -> list[tuple[str, Any]]:
+        """Return the sensors that draw, as (name, sensor)."""
+        return [(name, sensor) for name, sensor in self._sensors.items() if sensor.draws]

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import torch
 
+from mjlab.managers.build_checks import check_term
 from mjlab.managers.config_edits import changes, plain_values, write_changes
 from mjlab.managers.env_ids import EnvIds, as_index
 from mjlab.managers.error_labels import errors_named
@@ -190,6 +191,8 @@ class ManagerBase(ABC):
             if not callable(cfg.func):
                 raise TypeError(f"{self._label(name)}: {type(cfg.func).__name__} has no __call__.")
         self._check_parameters(name, cfg, leading)
+        with errors_named(self._label(name)):
+            check_term(cfg.func, self._env, cfg.params)
         self._keep_class_term(name, cfg.func)
 
     def _resolve_params(self, name: str, cfg: ManagerTermBaseCfg) -> None:

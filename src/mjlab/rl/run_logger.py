@@ -227,12 +227,16 @@ class RunLogger(Logger):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore `state_dict` of a run with as many environments."""
+        self.load_totals(state)
+        self.cur_reward_sum.copy_(state["reward_sums"])
+        self.cur_episode_length.copy_(state["episode_lengths"])
+
+    def load_totals(self, state: dict[str, Any]) -> None:
+        """Restore of `state_dict` what does not depend on the number of environments."""
         self.tot_timesteps = state["total_steps"]
         self.tot_time = state["total_time"]
         self.rewbuffer.extend(state["rewards"])
         self.lenbuffer.extend(state["lengths"])
-        self.cur_reward_sum.copy_(state["reward_sums"])
-        self.cur_episode_length.copy_(state["episode_lengths"])
 
 
 def _is_of_wandb(error: BaseException) -> bool:

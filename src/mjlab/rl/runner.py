@@ -21,6 +21,7 @@ from mjlab.rl.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
+from mjlab.rl.distributed import join_processes
 from mjlab.rl.evaluate import reward_unit
 from mjlab.rl.evaluation_result import EvaluationResult
 from mjlab.rl.exporter_utils import attach_metadata_to_onnx, get_base_metadata
@@ -39,12 +40,18 @@ from mjlab.rl.run_logger import RunLogger
 from mjlab.rl.solved import SolvedCheck
 from mjlab.rl.stop_request import StopRequest
 from mjlab.rl.threads import torch_threads, using_torch_threads
+from mjlab.utils.processes import process_rank
+from mjlab.utils.random import seed_rng
 
 logger = logging.getLogger(__name__)
 
 _RECURRENT_KEYS = ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")
 # What `learn` ends with, in the order in which one outweighs another between processes.
 _REASONS = ("", "solved", "interrupted")
+# From the seeds of a session of several processes to those of the one that resumes it an iteration
+# later: more than there are processes.
+_SEED_STRIDE = 100_003
+_NUM_SEEDS = 2**32
 
 
 class MjlabOnPolicyRunner(OnPolicyRunner):
@@ -60,6 +67,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
 
     # Any: an environment has more than rsl_rl's `VecEnv` says (`unwrapped`).
     env: Any
+
+    # Set by subclasses whose `save` exports the policy itself.
+    exports_on_save = False
 
     def __init__(
         self, env: VecEnv, train_cfg: dict, log_dir: str | None = None, device: str = "cpu"
@@ -375,9 +385,11 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             return self._observations
         if self.current_learning_iteration == 0 and state is None:
             return None
-        if state is None or self.is_distributed:
-            why = "several processes share the run" if state else "the checkpoint has none"
-            logger.warning("Episodes and random numbers start anew: %s.", why)
+        if state is None:
+            logger.warning("Episodes and random numbers start anew: the checkpoint has none.")
+            return None
+        if self.is_distributed:
+            self._resume_among_others(state)
             return None
         try:
             return training_state.restore(state, self.env, self.alg, self.logger)
@@ -388,6 +400,16 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             )  # fmt: skip
             return None
 
+    def _resume_among_others(self, state: dict[str, Any]) -> None:
+        """Restore what all processes share. A checkpoint has the episodes of the first only."""
+        logger.warning(
+            "Episodes and random numbers start anew, because several processes share the run."
+        )
+        self.logger.load_totals(state["logger"])
+        # Otherwise, every session would draw the numbers of the first one again.
+        seed = int(self.cfg.get("seed", 0)) + _SEED_STRIDE * self.current_learning_iteration
+        seed_rng(seed % _NUM_SEEDS)
+
     def _save_checkpoint(self) -> None:
         """Write a checkpoint into the run folder, and the policy as ONNX beside it."""
         if not self._writes or self.logger.log_dir is None:
@@ -395,7 +417,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         name = f"model_{self.current_learning_iteration - 1}.pt"
         path = os.path.join(self.logger.log_dir, name)
         self.save(path)
-        self.export_policy()
+        if not self.exports_on_save:
+            self.export_policy()
         self._tell("on_checkpoint", path)
 
     # Export.
@@ -447,6 +470,23 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         return dict(get_base_metadata(self.env.unwrapped, run))
 
     # Helpers.
+
+    def _configure_multi_gpu(self) -> None:
+        """Join the other processes of the run, if there are any. In place of rsl_rl's, which knows
+        GPUs only."""
+        rank = process_rank()
+        self.is_distributed = not rank.is_alone
+        self.gpu_world_size = rank.world_size
+        self.gpu_global_rank = rank.rank
+        self.gpu_local_rank = rank.local_rank
+        self.cfg["multi_gpu"] = None
+        if self.is_distributed:
+            join_processes(str(self.device))
+            self.cfg["multi_gpu"] = {
+                "global_rank": rank.rank,
+                "local_rank": rank.local_rank,
+                "world_size": rank.world_size,
+            }
 
     @property
     def _writes(self) -> bool:

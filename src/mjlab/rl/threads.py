@@ -9,12 +9,15 @@ from typing import Any
 
 import torch
 
+from mjlab.utils.processes import cores_per_process
+
 # Multiply-adds of one mini-batch (forward) above which several threads pay off. Measured: two
 # threads update 64x64 networks on 4096 rows (0.04e9) in 0.75 of the time of one thread on a quiet
 # machine, but in 5 to 40 times of it when anything else runs, because the threads of OpenMP wait
 # for each other by spinning.
 _WORTH_SEVERAL_THREADS = 0.4e9
 _MOST_THREADS = 8
+_TORCHRUN_VARIABLE = "TORCHELASTIC_RUN_ID"
 
 
 def torch_threads(num_parameters: int, batch_size: int) -> int:
@@ -22,27 +25,25 @@ def torch_threads(num_parameters: int, batch_size: int) -> int:
 
     It depends on the machine, the networks and the batch only, never on the threads of the
     physics: sums are split among threads, so their number decides the last bits of the weights.
-    `MJLAB_TORCH_THREADS` overrides it; `OMP_NUM_THREADS` limits it.
+    Several processes of a run on one machine share its cores. `MJLAB_TORCH_THREADS` overrides it;
+    `OMP_NUM_THREADS` limits it.
     """
     if override := os.environ.get("MJLAB_TORCH_THREADS"):
         return _positive("MJLAB_TORCH_THREADS", override)
     if num_parameters * batch_size < _WORTH_SEVERAL_THREADS:
         return 1
     limit = os.environ.get("OMP_NUM_THREADS")
+    if limit == "1" and _TORCHRUN_VARIABLE in os.environ:
+        # torchrun sets this for all that it starts, unasked; the cores are shared out here.
+        limit = None
     most = _positive("OMP_NUM_THREADS", limit) if limit else _MOST_THREADS
-    return max(1, min(_usable_cores(), most))
+    return max(1, min(cores_per_process(), most))
 
 
 def _positive(name: str, value: str) -> int:
     if not value.isdigit() or int(value) < 1:
         raise ValueError(f"{name} is {value!r}; it must be a positive whole number.")
     return int(value)
-
-
-def _usable_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 @contextlib.contextmanager

@@ -22,7 +22,7 @@ from mjlab.scene.options import (
     resolve_mujoco_cfg,
     write_requests,
 )
-from mjlab.sensor import BuiltinSensor, Sensor, SensorCfg
+from mjlab.sensor import BuiltinSensor, RayCastSensor, Sensor, SensorCfg, SensorContext
 from mjlab.terrains.terrain_entity import TerrainEntity, TerrainEntityCfg
 from mjlab.utils.spec import export_spec, make_asset_paths_absolute
 from mjlab.utils.state import stateful
@@ -59,7 +59,7 @@ class SceneCfg:
 class Scene:
     """What is in the world. Built from its config, then tied to a simulation by `initialize`."""
 
-    _transient = {"_env_origins", "_device"}
+    _transient = {"_env_origins", "_device", "_updated_sensors"}
 
     def __init__(self, scene_cfg: SceneCfg, device: str) -> None:
         """Compose the spec: terrain, entities, sensors, then the config's own edits.
@@ -76,6 +76,7 @@ class Scene:
         self._terrain: TerrainEntity | None = None
         self._entities: dict[str, Entity] = {}
         self._sensors: dict[str, Sensor[Any]] = {}
+        self._sensor_context: SensorContext | None = None
         self._add_terrain()
         self._add_entities()
         self.entity_options = self._apply_entity_options()
@@ -143,6 +144,10 @@ class Scene:
             # A sensor without a name cannot be asked for.
             if mj_sensor.name and mj_sensor.name not in self._sensors:
                 self._sensors[mj_sensor.name] = BuiltinSensor.from_existing(mj_sensor.name)
+        # Those of MuJoCo show the simulation itself, and have nothing to keep up to date.
+        self._updated_sensors = [
+            sensor for sensor in self._sensors.values() if type(sensor) is not BuiltinSensor
+        ]
 
     # Access.
 
@@ -203,9 +208,9 @@ class Scene:
         return self._sensors
 
     @property
-    def sensor_context(self) -> None:
-        """What evaluates camera and ray sensors; None, because the scene has no such sensors."""
-        return None
+    def sensor_context(self) -> SensorContext | None:
+        """What evaluates ray sensors, once the scene is initialized; None if it has none."""
+        return self._sensor_context
 
     @property
     def needs_substep(self) -> bool:
@@ -251,19 +256,22 @@ class Scene:
             self._spec.compile()
         for part in (*self._entities.values(), *self._sensors.values()):
             part.initialize(mj_model, model, data, self._device)
+        rays = [sensor for sensor in self._sensors.values() if isinstance(sensor, RayCastSensor)]
+        if rays:
+            self._sensor_context = SensorContext(mj_model, model, data, [], rays, self._device)
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Reset targets, delays, histories and sensors of environments; None means all."""
         for entity in self._entities.values():
             entity.reset(env_ids)
-        for sensor in self._sensors.values():
+        for sensor in self._updated_sensors:
             sensor.reset(env_ids)
 
     def update(self, dt: float) -> None:
         """Tell actuators and sensors that the simulation has advanced by `dt` seconds."""
         for entity in self._entities.values():
             entity.update(dt)
-        for sensor in self._sensors.values():
+        for sensor in self._updated_sensors:
             sensor.update(dt)
 
     def write_data_to_sim(self, env_ids: EnvIds = None) -> None:
@@ -273,7 +281,7 @@ class Scene:
 
     def invalidate_sensor_caches(self) -> None:
         """Have all sensors compute their data anew: derived quantities have changed."""
-        for sensor in self._sensors.values():
+        for sensor in self._updated_sensors:
             sensor.invalidate_cache()
 
     # Files.

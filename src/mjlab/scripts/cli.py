@@ -19,6 +19,18 @@ C = TypeVar("C")
 
 TRACEBACK_VARIABLE = "MJLAB_TRACEBACK"
 
+# Exit status of a process that gave up because another of its run failed.
+OTHER_PROCESS_STATUS = 3
+
+# Errors that a user can mend, of modules that are imported only where they are needed.
+_OTHER_PROCESS = ("mjlab.rl.distributed", "OtherProcessError")
+_LAZY_ERRORS = (
+    ("mjlab.sim.engine", "EngineUnavailableError"),
+    ("mjlab.rl.checkpoint", "CheckpointError"),
+    ("mjlab.viewer.errors", "RenderingUnavailableError"),
+    _OTHER_PROCESS,
+)
+
 
 class UserError(Exception):
     """A mistake in what was asked for, told in one message."""
@@ -51,10 +63,19 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
             raise
         if os.environ.get(TRACEBACK_VARIABLE):
             traceback.print_exc()
-        print(f"error: {_text(error)}", file=sys.stderr)
-        print(f"(Set {TRACEBACK_VARIABLE}=1 for where it came from.)", file=sys.stderr)
-        sys.exit(1)
+        blameless = isinstance(error, _classes(_OTHER_PROCESS))
+        rank = os.environ.get("RANK", "0")
+        # Of several processes, the one that failed and the first have something to say.
+        if rank == "0" or not blameless:
+            _print_error(error, rank)
+        sys.exit(OTHER_PROCESS_STATUS if blameless else 1)
     sys.exit(0)
+
+
+def _print_error(error: BaseException, rank: str) -> None:
+    process = "" if rank == "0" else f" in process {rank}"
+    print(f"error{process}: {_text(error)}", file=sys.stderr)
+    print(f"(Set {TRACEBACK_VARIABLE}=1 for where it came from.)", file=sys.stderr)
 
 
 def _one_line(
@@ -70,17 +91,16 @@ def _one_line(
 def _user_errors() -> tuple[type[BaseException], ...]:
     from mjlab.tasks.registry import UnknownTaskError
 
-    errors: list[type[BaseException]] = [UserError, UnknownTaskError, ValueError, OSError]
+    return (UserError, UnknownTaskError, ValueError, OSError, *_classes(*_LAZY_ERRORS))
+
+
+def _classes(*names: tuple[str, str]) -> tuple[type[BaseException], ...]:
     # Classes of modules that were never imported cannot have been raised.
-    for module_name, class_name in (
-        ("mjlab.sim.engine", "EngineUnavailableError"),
-        ("mjlab.rl.checkpoint", "CheckpointError"),
-        ("mjlab.viewer.errors", "RenderingUnavailableError"),
-    ):
-        module = sys.modules.get(module_name)
-        if module is not None:
-            errors.append(getattr(module, class_name))
-    return tuple(errors)
+    return tuple(
+        getattr(sys.modules[module_name], class_name)
+        for module_name, class_name in names
+        if module_name in sys.modules
+    )
 
 
 def _raised_on_purpose(error: BaseException) -> bool:

@@ -30,12 +30,19 @@ def __getattr__(name: str) -> Any:
 
 def _command(argv: list[str]) -> None:
     task, flags = task_and_flags(argv, _USAGE)
-    from mjlab.scripts.cli import parse_flags
     from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
-    from mjlab.tasks.registry import load_env_cfg
+    from mjlab.scripts.policy import policy_env_cfg, profile_of_policy
+    from mjlab.scripts.profiles import parse_with_profile
 
-    default = EvaluateConfig(env=load_env_cfg(task))
-    run_evaluate(task, parse_flags(EvaluateConfig, default, flags, f"evaluate {task}"))
+    cfg = parse_with_profile(
+        lambda profile: EvaluateConfig(
+            env=policy_env_cfg(task, profile, play=False), profile=profile
+        ),
+        lambda cfg: profile_of_policy(task, cfg),
+        flags,
+        prog=f"evaluate {task}",
+    )
+    run_evaluate(task, cfg)
 
 
 def main() -> None:

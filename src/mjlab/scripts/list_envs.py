@@ -17,16 +17,22 @@ def list_environments(keyword: str | None = None) -> list[str]:
 
 
 def _command(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="list-envs", description="List the registered tasks.")
+    parser = argparse.ArgumentParser(
+        prog="list-envs", description="List the registered tasks, and their profiles."
+    )
     parser.add_argument("--keyword", help="show only tasks whose name contains this")
     args = parser.parse_args(argv)
     names = list_environments(args.keyword)
     if not names:
         print(f"No task's name contains {args.keyword!r}.", file=sys.stderr)
         sys.exit(1)
-    width = len(str(len(names)))
+    from mjlab.tasks.registry import list_profiles
+
+    digits, width = len(str(len(names))), max(map(len, names))
     for number, name in enumerate(names, start=1):
-        print(f"{number:>{width}}  {name}")
+        profiles = list_profiles(name)
+        shown = f"  (profiles: {', '.join(profiles)})" if profiles else ""
+        print(f"{number:>{digits}}  {name:<{width}}{shown}".rstrip())
 
 
 def main() -> None:

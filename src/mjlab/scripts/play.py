@@ -32,12 +32,17 @@ def __getattr__(name: str) -> Any:
 
 def _command(argv: list[str]) -> None:
     task, flags = task_and_flags(argv, _USAGE)
-    from mjlab.scripts.cli import parse_flags
     from mjlab.scripts.play_run import PlayConfig, run_play
-    from mjlab.tasks.registry import load_env_cfg
+    from mjlab.scripts.policy import policy_env_cfg, profile_of_policy
+    from mjlab.scripts.profiles import parse_with_profile
 
-    default = PlayConfig(env=load_env_cfg(task, play=True))
-    run_play(task, parse_flags(PlayConfig, default, flags, prog=f"play {task}"))
+    cfg = parse_with_profile(
+        lambda profile: PlayConfig(env=policy_env_cfg(task, profile, play=True), profile=profile),
+        lambda cfg: profile_of_policy(task, cfg),
+        flags,
+        prog=f"play {task}",
+    )
+    run_play(task, cfg)
 
 
 def main() -> None:

@@ -75,10 +75,10 @@ def run_play(task: str, cfg: PlayConfig) -> None:
     if cfg.video:
         _record(task, cfg, env_cfg, checkpoint, device)
         return
-    env = make_env(task, env_cfg, device, cfg.num_envs, cfg.engine)
+    env = make_env(task, env_cfg, device, cfg.num_envs, cfg.engine, profile=cfg.profile)
     print(f"Physics:    {env.unwrapped.sim.capabilities.description}")
     try:
-        policy = make_policy(task, env, cfg.agent, checkpoint, device)
+        policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
         if cfg.viewer == "none" and cfg.num_steps is not None:
             _play_headless(env, policy, cfg.num_steps)
         else:
@@ -114,7 +114,7 @@ def _make_viewer(
     if checkpoint is not None:
         source = LocalCheckpoints(
             checkpoint.parent,
-            lambda path: load_policy(task, env, path, device),
+            lambda path: load_policy(task, env, path, device, cfg.profile),
             current=checkpoint.name,
         )
     viewer = ViserPlayViewer(env, policy, checkpoints=source, host=cfg.host, port=cfg.port)
@@ -147,5 +147,6 @@ def _record(
             num_envs=cfg.num_envs,
             engine=cfg.engine,
             agent=cfg.agent,
+            profile=cfg.profile,
         ),
     )

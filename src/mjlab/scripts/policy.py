@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.scripts.cli import UserError, tell
+from mjlab.scripts.profiles import profile_of_run
 from mjlab.scripts.run_folder import named_checkpoint, newest_checkpoint, read_agent_params
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 
@@ -47,11 +48,20 @@ class PolicyFlags:
     """Physics engine."""
     log_root: str = "logs/rsl_rl"
     """Folder of all runs."""
+    profile: str | None = None
+    """Named settings of the task, such as `cpu`. None: those that the policy was trained with."""
     env: ManagerBasedRlEnvCfg | None = None
     """The environment; None takes the task's config."""
 
 
-def make_policy(task: str, env: Any, agent: str, checkpoint: Path | None, device: str) -> Any:
+def make_policy(
+    task: str,
+    env: Any,
+    agent: str,
+    checkpoint: Path | None,
+    device: str,
+    profile: str | None = None,
+) -> Any:
     """Return the policy in `checkpoint`, or where there is none the constant one of `agent`.
 
     Raises:
@@ -59,11 +69,15 @@ def make_policy(task: str, env: Any, agent: str, checkpoint: Path | None, device
     """
     if checkpoint is None:
         return constant_policy(env, agent)
-    return load_policy(task, env, checkpoint, device)
+    return load_policy(task, env, checkpoint, device, profile)
 
 
-def load_policy(task: str, env: Any, checkpoint: Path, device: str) -> Any:
+def load_policy(
+    task: str, env: Any, checkpoint: Path, device: str, profile: str | None = None
+) -> Any:
     """Return the deterministic policy in `checkpoint`, for the wrapped environment `env`.
+
+    `profile` is the profile of the task that it was trained with.
 
     Raises:
         CheckpointError: the file is missing, damaged, or holds another network.
@@ -71,17 +85,17 @@ def load_policy(task: str, env: Any, checkpoint: Path, device: str) -> Any:
     from mjlab.rl import MjlabOnPolicyRunner
 
     runner_cls: Any = load_runner_cls(task) or MjlabOnPolicyRunner
-    runner = runner_cls(env, _agent_cfg(task, checkpoint), None, device)
+    runner = runner_cls(env, _agent_cfg(task, checkpoint, profile), None, device)
     runner.load(str(checkpoint), load_cfg={"actor": True}, strict=True, map_location=device)
     return runner.get_inference_policy(device=device)
 
 
-def _agent_cfg(task: str, checkpoint: Path) -> dict[str, Any]:
+def _agent_cfg(task: str, checkpoint: Path, profile: str | None = None) -> dict[str, Any]:
     """Return the learner's config of `task`, with the networks that the checkpoint's run had.
 
-    The command line may have given them other sizes than the task does.
+    The command line may have given them other sizes than the task and its profile do.
     """
-    cfg = asdict(load_rl_cfg(task))
+    cfg = asdict(load_rl_cfg(task, profile=profile))
     saved = read_agent_params(checkpoint.parent)
     for network in ("actor", "critic"):
         sizes = saved.get(network)
@@ -105,7 +119,7 @@ def find_checkpoint(task: str, flags: PolicyFlags) -> Path | None:
         return None
     if flags.checkpoint_file is not None:
         return named_checkpoint(Path(flags.checkpoint_file), task)
-    experiment = Path(flags.log_root).resolve() / load_rl_cfg(task).experiment_name
+    experiment = _experiment(task, flags)
     if flags.wandb_run_path is not None:
         from mjlab.utils.os import get_wandb_checkpoint_path
 
@@ -119,6 +133,30 @@ def find_checkpoint(task: str, flags: PolicyFlags) -> Path | None:
         )
     tell(f"Checkpoint: {path}")
     return path
+
+
+def _experiment(task: str, flags: PolicyFlags) -> Path:
+    return Path(flags.log_root).resolve() / load_rl_cfg(task).experiment_name
+
+
+def profile_of_policy(task: str, flags: PolicyFlags) -> str | None:
+    """Return the profile that the policy which the flags name was trained with, if it is known.
+
+    That of a Weights & Biases run is not: its files come without what the run says about itself.
+    """
+    if flags.agent != "trained":
+        return None
+    if flags.checkpoint_file is None:
+        if flags.wandb_run_path is not None:
+            return None
+        path = newest_checkpoint(_experiment(task, flags), task)
+    else:
+        try:
+            path = named_checkpoint(Path(flags.checkpoint_file), task)
+        except UserError:
+            # It is told when the policy is looked for in earnest.
+            return None
+    return None if path is None else profile_of_run(task, path.parent)
 
 
 def constant_policy(env: Any, kind: str) -> Any:
@@ -141,8 +179,12 @@ def make_env(
     *,
     seed: int | None = None,
     render_mode: str | None = None,
+    profile: str | None = None,
 ) -> Any:
-    """Return the wrapped environment of `cfg`; what is None is left as `cfg` has it."""
+    """Return the wrapped environment of `cfg`; what is None is left as `cfg` has it.
+
+    Actions are clipped as the learner's config of the task says, under `profile`.
+    """
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.rl import RslRlVecEnvWrapper
 
@@ -153,9 +195,21 @@ def make_env(
     if engine is not None:
         cfg.sim.engine = engine
     env = ManagerBasedRlEnv(cfg, device=device, render_mode=render_mode)
-    return RslRlVecEnvWrapper(env, clip_actions=load_rl_cfg(task).clip_actions)
+    clip_actions = load_rl_cfg(task, profile=profile).clip_actions
+    return RslRlVecEnvWrapper(env, clip_actions=clip_actions)
 
 
 def env_cfg_of(task: str, flags: PolicyFlags, *, play: bool) -> ManagerBasedRlEnvCfg:
     """Return the environment config in `flags`, or the task's own to `play` or to train with."""
-    return load_env_cfg(task, play=play) if flags.env is None else flags.env
+    if flags.env is not None:
+        return flags.env
+    return policy_env_cfg(task, flags.profile, play=play)
+
+
+def policy_env_cfg(task: str, profile: str | None, *, play: bool) -> ManagerBasedRlEnvCfg:
+    """Return the environment config of `task` under `profile`, with as many environments as the
+    task has without it: how many of them learning takes says nothing about how many to look at."""
+    cfg = load_env_cfg(task, play=play, profile=profile)
+    if profile is not None:
+        cfg.scene.num_envs = load_env_cfg(task, play=play).scene.num_envs
+    return cfg

@@ -33,6 +33,8 @@ class VideoCfg:
     """Physics engine; None keeps the task's."""
     agent: str = "trained"
     """Who acts where there is no checkpoint: `zero` or `random`."""
+    profile: str | None = None
+    """Profile of the task that the policy was trained with."""
 
 
 def record_policy(
@@ -57,9 +59,17 @@ def record_policy(
     env_cfg = copy.deepcopy(env_cfg)
     env_cfg.viewer.height = video.height or env_cfg.viewer.height
     env_cfg.viewer.width = video.width or env_cfg.viewer.width
-    env = make_env(task, env_cfg, device, video.num_envs, video.engine, render_mode="rgb_array")
+    env = make_env(
+        task,
+        env_cfg,
+        device,
+        video.num_envs,
+        video.engine,
+        render_mode="rgb_array",
+        profile=video.profile,
+    )
     try:
-        policy = make_policy(task, env, video.agent, checkpoint, device)
+        policy = make_policy(task, env, video.agent, checkpoint, device, video.profile)
         name = video.agent if checkpoint is None else checkpoint.stem
         writer = ClipWriter(
             folder / f"{task}-{name}.{video.suffix}", env.unwrapped.metadata["render_fps"]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjlab.scripts.cli import UserError, tell
+from mjlab.scripts.profiles import profile_of_run
 from mjlab.scripts.run_folder import read_env_params, read_run_info, run_folders
 from mjlab.tasks.registry import load_env_cfg
 
@@ -47,6 +48,24 @@ def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
     return get_checkpoint_path(experiment, pattern, agent.load_checkpoint)
 
 
+def profile_to_resume(task: str, cfg: TrainConfig) -> str | None:
+    """Return the profile of the run that `cfg` asks to go on from; None if it had none.
+
+    That of a Weights & Biases run is not known: its files do not say it.
+    """
+    if cfg.wandb_run_path is not None:
+        return None
+    try:
+        checkpoint = checkpoint_to_resume(task, cfg)
+    except (UserError, ValueError, OSError):
+        # It is told when training is to start, after what else may be wrong with the flags.
+        return None
+    profile = None if checkpoint is None else profile_of_run(task, checkpoint.parent)
+    if profile is not None:
+        tell(f"Resuming with the profile {profile!r}, as before; --profile gives another.")
+    return profile
+
+
 def keep_number_of_environments(task: str, cfg: TrainConfig, checkpoint: Path) -> None:
     """Go on with as many environments as the resumed run had, unless the flags give a number.
 
@@ -56,7 +75,8 @@ def keep_number_of_environments(task: str, cfg: TrainConfig, checkpoint: Path) -
         CheckpointError: the checkpoint cannot be read.
     """
     scene = cfg.env.scene
-    if cfg.num_envs is not None or scene.num_envs != load_env_cfg(task).scene.num_envs:
+    usual = load_env_cfg(task, profile=cfg.profile).scene.num_envs
+    if cfg.num_envs is not None or scene.num_envs != usual:
         return
     count = _saved_num_envs(checkpoint)
     if count is None:

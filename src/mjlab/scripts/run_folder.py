@@ -61,6 +61,17 @@ class NewRunFolder:
             shutil.rmtree(self.path, ignore_errors=True)
 
 
+class SharedRunFolder:
+    """The run's folder as the processes see it that did not make it, with the methods they need."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        """The folder that the first process made."""
+
+    def keep(self) -> None:
+        """Do nothing: the first process decides."""
+
+
 def write_run_info(run_dir: Path, **info: Any) -> None:
     """Add entries to what `run_dir` says about its run (`run.json`)."""
     path = run_dir / _INFO_FILE

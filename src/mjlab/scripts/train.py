@@ -32,11 +32,20 @@ def __getattr__(name: str) -> Any:
 
 def _command(argv: list[str]) -> None:
     task, flags = task_and_flags(argv, _USAGE)
-    from mjlab.scripts.cli import parse_flags
-    from mjlab.scripts.train_run import TrainConfig, launch_training
+    from mjlab.scripts.train_run import check_flags, launch_training, parse_train_flags
+    from mjlab.scripts.training_device import gpus_to_share
 
-    cfg = parse_flags(TrainConfig, TrainConfig.from_task(task), flags, prog=f"train {task}")
-    launch_training(task, cfg)
+    cfg = parse_train_flags(task, flags, prog=f"train {task}")
+    gpus = gpus_to_share(cfg)
+    if not gpus:
+        launch_training(task, cfg)
+        return
+    from mjlab.scripts.launcher import launch_workers, train_command
+
+    check_flags(cfg)
+    # Of the GPUs that they see, the processes use all.
+    command = train_command(task, [*flags, "--gpu-ids", "all"])
+    launch_workers(command, len(gpus), {"CUDA_VISIBLE_DEVICES": ",".join(map(str, gpus))})
 
 
 def main() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import sys
+from collections.abc import Generator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,14 +13,19 @@ from typing import TYPE_CHECKING, Any, Literal
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import RslRlBaseRunnerCfg
 from mjlab.rl.progress import TrainingObserver
-from mjlab.scripts.cli import UserError, resolve_device
+from mjlab.scripts.cli import UserError
+from mjlab.scripts.process_output import ProcessOutput, log_file, output_of
+from mjlab.scripts.profiles import parse_with_profile, suggest_profile
 from mjlab.scripts.resume import (
     checkpoint_to_resume,
     is_finished,
     keep_number_of_environments,
+    profile_to_resume,
 )
-from mjlab.scripts.run_folder import NewRunFolder, write_run_info
+from mjlab.scripts.run_folder import NewRunFolder, SharedRunFolder, write_run_info
+from mjlab.scripts.training_device import training_device
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
+from mjlab.utils.processes import ProcessRank, cores_per_process, process_rank
 
 if TYPE_CHECKING:
     from mjlab.rl import MjlabOnPolicyRunner
@@ -39,10 +45,14 @@ class TrainConfig:
     """The task."""
     agent: RslRlBaseRunnerCfg
     """The learner."""
+    profile: str | None = None
+    """Named settings of the task, such as `cpu`, that all other flags start from; `list-envs` shows
+    which there are. None: the task's own, or where a run is resumed, that run's."""
     num_envs: int | None = None
-    """Number of environments; short for --env.scene.num-envs."""
+    """Number of environments, of each process; short for --env.scene.num-envs."""
     device: str | None = None
-    """Torch device: cpu, cuda:0, ... None takes a GPU where there is one."""
+    """Torch device: cpu, cuda:0, ... None takes a GPU where there is one; several processes take
+    one each."""
     engine: Literal["auto", "native", "warp"] | None = None
     """Physics engine; short for --env.sim.engine."""
     video: bool = False
@@ -57,17 +67,39 @@ class TrainConfig:
     """Dump the states that lead to NaN."""
     log_root: str = "logs/rsl_rl"
     """Folder of all runs."""
+    torchrunx_log_dir: str | None = None
+    """Folder for what processes other than the first print; None is `torchrunx` in the run's
+    folder, and an empty name drops it. The variable TORCHRUNX_LOG_DIR wins."""
     wandb_run_path: str | None = None
     """With --agent.resume True: the Weights & Biases run to resume, as entity/project/run."""
     wandb_checkpoint_name: str | None = None
     """Checkpoint of that run; None takes the newest."""
     gpu_ids: list[int] | Literal["all"] | None = field(default_factory=lambda: [0])
-    """Indices of the GPUs to use where --device is not given; None trains on the CPU."""
+    """Indices of the GPUs to use where --device is not given, or `all`; with several, a process
+    for each is started. None trains on the CPU."""
 
     @staticmethod
-    def from_task(task: str) -> TrainConfig:
-        """Return the configuration that a task was registered with."""
-        return TrainConfig(env=load_env_cfg(task), agent=load_rl_cfg(task))
+    def from_task(task: str, profile: str | None = None) -> TrainConfig:
+        """Return the configuration that a task was registered with, under one of its profiles."""
+        return TrainConfig(
+            env=load_env_cfg(task, profile=profile),
+            agent=load_rl_cfg(task, profile=profile),
+            profile=profile,
+        )
+
+
+def parse_train_flags(task: str, flags: list[str], prog: str) -> TrainConfig:
+    """Return the configuration of `task` with what `flags` change; exits on an unknown flag.
+
+    Raises:
+        UnknownProfileError: the task has no such profile.
+    """
+    return parse_with_profile(
+        lambda profile: TrainConfig.from_task(task, profile),
+        lambda cfg: profile_to_resume(task, cfg),
+        flags,
+        prog,
+    )
 
 
 def launch_training(task: str, cfg: TrainConfig) -> Path:
@@ -80,35 +112,79 @@ def launch_training(task: str, cfg: TrainConfig) -> Path:
         UserError, ValueError, OSError, CheckpointError, EngineUnavailableError: what was asked for
             cannot be done; raised before training starts wherever that can be known.
     """
-    _check_numbers(cfg)
-    _check_names(cfg)
-    device = _device(cfg)
-    _apply_short_forms(cfg)
-    checkpoint = checkpoint_to_resume(task, cfg)
+    from mjlab.rl.distributed import joined_processes, same_fate
+
+    rank = process_rank()
+    with output_of(rank) as output:
+        device = training_device(cfg, rank)
+        with joined_processes(device):
+            with same_fate():
+                check_flags(cfg)
+            return _train(task, cfg, device, rank, output)
+
+
+def _train(
+    task: str, cfg: TrainConfig, device: str, rank: ProcessRank, output: ProcessOutput | None
+) -> Path:
+    from mjlab.rl.distributed import from_first, same_fate
+
+    _apply_short_forms(cfg, rank)
+    # The checkpoint is looked for before there is a new folder to be found, and by one process.
+    checkpoint = from_first(lambda: checkpoint_to_resume(task, cfg))
     if checkpoint is not None:
         keep_number_of_environments(task, cfg, checkpoint)
-    experiment = Path(cfg.log_root).resolve() / cfg.agent.experiment_name
-    with NewRunFolder(experiment, cfg.agent.run_name) as folder:
-        env = _build_env(cfg, device, folder.path)
+    else:
+        suggest_profile(task, cfg.profile, device)
+    with _run_folder(cfg, rank, output) as folder:
+        with same_fate():
+            env = _build_env(cfg, device, folder.path, rank)
         try:
-            print(f"Task:    {task}, {env.num_envs} environments")
+            under = f", profile {cfg.profile}" if cfg.profile else ""
+            each = "" if rank.is_alone else f" in each of {rank.world_size} processes"
+            print(f"Task:    {task}, {env.num_envs} environments{each}{under}")
             print(f"Physics: {env.unwrapped.sim.capabilities.description}", flush=True)
-            runner = _build_runner(task, cfg, env, folder.path, device)
+            with same_fate():
+                runner = _build_runner(task, cfg, env, folder.path, device)
+                if checkpoint is not None:
+                    runner.load(str(checkpoint))
             if checkpoint is not None:
-                runner.load(str(checkpoint))
                 if is_finished(cfg, runner, checkpoint):
                     return checkpoint.parent
                 print(f"Resumed: {checkpoint}, iteration {runner.current_learning_iteration}")
             print(f"Run:     {folder.path}", flush=True)
-            _write_params(task, cfg, folder.path)
+            if rank.is_first:
+                _write_params(task, cfg, folder.path)
             _learn(task, cfg, runner, folder)
         finally:
             env.close()
-    _leave_results(task, cfg, folder.path, device)
+    if rank.is_first:
+        _leave_results(task, cfg, folder.path, device)
     return folder.path
 
 
 run_train = launch_training
+
+
+@contextlib.contextmanager
+def _run_folder(
+    cfg: TrainConfig, rank: ProcessRank, output: ProcessOutput | None
+) -> Generator[NewRunFolder | SharedRunFolder]:
+    """Be in the run's folder, which the first process makes for all."""
+    from mjlab.rl.distributed import from_first
+
+    experiment = Path(cfg.log_root).resolve() / cfg.agent.experiment_name
+    with contextlib.ExitStack() as stack:
+        new = NewRunFolder(experiment, cfg.agent.run_name)
+        path = from_first(lambda: stack.enter_context(new).path)
+        if output is not None:
+            output.keep_in(log_file(rank, cfg.torchrunx_log_dir, path))
+        yield new if rank.is_first else SharedRunFolder(path)
+
+
+def check_flags(cfg: TrainConfig) -> None:
+    """Raise UserError for what is wrong in the flags and can be told without building anything."""
+    _check_numbers(cfg)
+    _check_names(cfg)
 
 
 def _check_numbers(cfg: TrainConfig) -> None:
@@ -139,41 +215,29 @@ def _check_names(cfg: TrainConfig) -> None:
         )
 
 
-def _device(cfg: TrainConfig) -> str:
-    if cfg.device is not None:
-        return resolve_device(cfg.device)
-    from mjlab.utils.gpu import select_gpus
-
-    selected, count = select_gpus(cfg.gpu_ids)
-    if count > 1:
-        raise UserError(
-            f"--gpu-ids names {count} GPUs; training on several GPUs is not available yet. Name one."
-        )
-    if selected is None:
-        return "cpu"
-    # torch numbers the GPUs that are visible, and so does --gpu-ids.
-    index = 0 if cfg.gpu_ids in ("all", None) else cfg.gpu_ids[0]
-    return resolve_device(f"cuda:{index}")
-
-
-def _apply_short_forms(cfg: TrainConfig) -> None:
+def _apply_short_forms(cfg: TrainConfig, rank: ProcessRank) -> None:
     if cfg.num_envs is not None:
         cfg.env.scene.num_envs = cfg.num_envs
     if cfg.engine is not None:
         cfg.env.sim.engine = cfg.engine
     if cfg.enable_nan_guard:
         cfg.env.sim.nan_guard.enabled = True
+    # Every process draws other random numbers.
+    cfg.agent.seed += rank.rank
     cfg.env.seed = cfg.agent.seed
+    if rank.local_world_size > 1 and cfg.env.sim.num_threads == 0:
+        cfg.env.sim.num_threads = cores_per_process()
 
 
-def _build_env(cfg: TrainConfig, device: str, run_dir: Path) -> Any:
+def _build_env(cfg: TrainConfig, device: str, run_dir: Path, rank: ProcessRank) -> Any:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.rl import RslRlVecEnvWrapper
 
+    records = cfg.video and rank.is_first
     env: Any = ManagerBasedRlEnv(
-        cfg.env, device=device, render_mode="rgb_array" if cfg.video else None
+        cfg.env, device=device, render_mode="rgb_array" if records else None
     )
-    if cfg.video:
+    if records:
         from mjlab.utils.wrappers import VideoRecorder
 
         env = VideoRecorder(
@@ -189,7 +253,7 @@ def _build_env(cfg: TrainConfig, device: str, run_dir: Path) -> Any:
 def _write_params(task: str, cfg: TrainConfig, run_dir: Path) -> None:
     from mjlab.utils.os import dump_yaml
 
-    write_run_info(run_dir, task=task, command=sys.argv)
+    write_run_info(run_dir, task=task, profile=cfg.profile, command=sys.argv)
     dump_yaml(run_dir / "params" / "env.yaml", asdict(cfg.env))
     dump_yaml(run_dir / "params" / "agent.yaml", asdict(cfg.agent))
 
@@ -214,16 +278,24 @@ def _build_runner(
 class _Beginning(TrainingObserver):
     """Keeps the run's folder once there is a run."""
 
-    def __init__(self, folder: NewRunFolder) -> None:
+    def __init__(self, folder: NewRunFolder | SharedRunFolder) -> None:
         self._folder = folder
 
     def on_start(self, first_iteration: int, total_iterations: int) -> None:
         self._folder.keep()
 
 
-def _learn(task: str, cfg: TrainConfig, runner: MjlabOnPolicyRunner, folder: NewRunFolder) -> None:
+def _learn(
+    task: str,
+    cfg: TrainConfig,
+    runner: MjlabOnPolicyRunner,
+    folder: NewRunFolder | SharedRunFolder,
+) -> None:
     from mjlab.scripts.display import TrainingDisplay
 
+    if isinstance(folder, SharedRunFolder):
+        runner.learn(cfg.agent.max_iterations, init_at_random_ep_len=True)
+        return
     runner.observers += [_Beginning(folder), TrainingDisplay(task)]
     try:
         runner.learn(cfg.agent.max_iterations, init_at_random_ep_len=True)
@@ -248,12 +320,18 @@ def _leave_results(task: str, cfg: TrainConfig, run_dir: Path, device: str) -> N
     plot_run(run_dir, run_dir / "learning_curve.png", title=task)
     checkpoint = latest_checkpoint(run_dir)
     if cfg.result_video and checkpoint is not None:
-        from mjlab.scripts.record import record_policy
+        from mjlab.scripts.policy import policy_env_cfg
+        from mjlab.scripts.record import VideoCfg, record_policy
         from mjlab.viewer.errors import RenderingUnavailableError
 
         try:
             record_policy(
-                task, load_env_cfg(task, play=True), checkpoint, run_dir / "videos", device
+                task,
+                policy_env_cfg(task, cfg.profile, play=True),
+                checkpoint,
+                run_dir / "videos",
+                device,
+                VideoCfg(profile=cfg.profile),
             )
         except RenderingUnavailableError as error:
             print(f"No video: {error}")

@@ -73,10 +73,9 @@ def _take_count(flags: list[str]) -> tuple[int, list[str]]:
 
 def _experiment(task: str, flags: list[str]) -> Path:
     """Return the folder that the runs go to. Mistaken flags end the command here, `--help` too."""
-    from mjlab.scripts.cli import parse_flags
-    from mjlab.scripts.train_run import TrainConfig
+    from mjlab.scripts.train_run import parse_train_flags
 
-    cfg = parse_flags(TrainConfig, TrainConfig.from_task(task), flags, prog=f"train-seeds {task}")
+    cfg = parse_train_flags(task, flags, prog=f"train-seeds {task}")
     return Path(cfg.log_root).resolve() / cfg.agent.experiment_name
 
 

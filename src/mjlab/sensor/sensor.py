@@ -94,5 +94,10 @@ class Sensor(ABC, Generic[T]):
         """Whether `update` has to be called after every physics substep."""
         return type(self).update is not Sensor.update
 
+    @property
+    def draws(self) -> bool:
+        """Whether `debug_vis` draws anything, so that viewers offer a switch for it."""
+        return type(self).debug_vis is not Sensor.debug_vis
+
     def debug_vis(self, visualizer: DebugVisualizer) -> None:
         """Draw what the sensor measures; nothing by default."""

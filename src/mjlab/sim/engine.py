@@ -126,13 +126,19 @@ class Engine(ABC):
         directions: torch.Tensor,
         geom_groups: tuple[int, ...] | None,
         exclude_body_ids: torch.Tensor | None,
+        max_distances: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Cast R world-frame rays per environment.
+        """Cast R world-frame rays per environment at the current state.
+
+        A ray meets the nearest surface that it may meet: planes from above, the outside of
+        meshes, the top of height fields from above, and either side of other geoms. A geom that is
+        fully transparent (its material's alpha counts, where it has one) is not there.
 
         Args:
             origins: (N, R, 3) metres. directions: (N, R, 3) unit vectors.
             geom_groups: groups that can be hit; None means all six.
             exclude_body_ids: (R,) int32 body whose own geoms are ignored, -1 for none.
+            max_distances: (R,) metres; what is farther away is a miss. None for no limit.
 
         Returns:
             distances (N, R), -1 on a miss; normals (N, R, 3), zero on a miss; geom ids (N, R)

@@ -251,10 +251,10 @@ class Simulation:
     def sense(self) -> None:
         """Evaluate camera and ray sensors at the current poses; nothing without such sensors."""
         if self._sensor_context is not None:
-            self._sensor_context.sense()
+            self._sensor_context.sense(self.raycast)
 
     def set_sensor_context(self, ctx: Any) -> None:
-        """Set the object whose `sense()` evaluates camera and ray sensors."""
+        """Set the object whose `sense(raycast)` evaluates camera and ray sensors."""
         self._sensor_context = ctx
 
     def create_graph(self) -> None:
@@ -271,14 +271,18 @@ class Simulation:
         directions: torch.Tensor,
         geom_groups: tuple[int, ...] | None = None,
         exclude_body_ids: torch.Tensor | None = None,
+        max_distances: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Cast rays: (N, R, 3) world origins and unit directions.
 
-        Returns distances (N, R) with -1 on a miss, normals (N, R, 3), geom ids (N, R). Only geoms
-        of `geom_groups` (None: all) are hit; `exclude_body_ids` (R,) names a body per ray whose
-        own geoms are not (-1: none).
+        Returns distances (N, R) with -1 on a miss, normals (N, R, 3) with 0, geom ids (N, R) with
+        -1. Only geoms of `geom_groups` (None: all) are hit; `exclude_body_ids` (R,) names a body
+        per ray whose own geoms are not (-1: none); what is farther than `max_distances` (R,) is a
+        miss. Planes are hit from above only, meshes and height fields from outside only.
         """
-        return self._engine.raycast(origins, directions, geom_groups, exclude_body_ids)
+        return self._engine.raycast(
+            origins, directions, geom_groups, exclude_body_ids, max_distances
+        )
 
     def jacobian(
         self, points: torch.Tensor, body_ids: torch.Tensor

@@ -16,7 +16,7 @@ import inspect
 import logging
 import pkgutil
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
@@ -37,8 +37,12 @@ class UnknownTaskError(KeyError):
         return str(self.args[0])
 
 
+class UnknownProfileError(ValueError):
+    """Raised for a profile that a task does not have; the message lists those it has."""
+
+
 class TaskImportError(RuntimeError):
-    """Raised for a task whose config or runner, given by name, cannot be imported."""
+    """Raised for a task whose config, runner or profile, given by name, cannot be imported."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,7 @@ class _Task:
     play_env_cfg: Any
     rl_cfg: Any
     runner_cls: Any
+    profiles: dict[str, Any]
 
 
 _tasks: dict[str, _Task] = {}
@@ -59,6 +64,7 @@ def register_mjlab_task(
     play_env_cfg: ManagerBasedRlEnvCfg | Callable[..., ManagerBasedRlEnvCfg] | str | None = None,
     rl_cfg: RslRlBaseRunnerCfg | Callable[[], RslRlBaseRunnerCfg] | str | None = None,
     runner_cls: type | str | None = None,
+    profiles: Mapping[str, Callable[[Any, Any], None] | str] | None = None,
 ) -> None:
     """Register a task under `task_id`.
 
@@ -70,15 +76,26 @@ def register_mjlab_task(
             with `play=True` if it takes that, or reuses its config.
         rl_cfg: the config of the learner, likewise.
         runner_cls: the runner class or its name as `module:Class`; None takes the default.
+        profiles: named settings for other circumstances, such as `cpu` for learning on a few
+            cores: for each name a function `(env_cfg, rl_cfg) -> None`, or its name as
+            `module:function`, that edits copies of the task's configs in place. Flags of the
+            command line come after it and win. It may not change `rl_cfg.experiment_name`, by
+            which runs of the task are found.
 
     Raises:
-        ValueError: the name is taken, or `rl_cfg` is missing.
+        ValueError: the name is taken, `rl_cfg` is missing, or a profile's name is no single word.
     """
     if task_id in _tasks:
         raise ValueError(f"A task named {task_id!r} is registered already; choose another name.")
     if rl_cfg is None:
         raise ValueError(f"Task {task_id!r} needs an rl_cfg (an RslRlOnPolicyRunnerCfg).")
-    _tasks[task_id] = _Task(env_cfg, play_env_cfg, rl_cfg, runner_cls)
+    for profile in profiles or {}:
+        if not profile.replace("-", "_").isidentifier() or profile == "None":
+            raise ValueError(
+                f"Task {task_id!r} has a profile named {profile!r}; a name is one word of letters, "
+                "digits, '-' and '_', such as 'cpu', and not 'None'."
+            )
+    _tasks[task_id] = _Task(env_cfg, play_env_cfg, rl_cfg, runner_cls, dict(profiles or {}))
 
 
 def list_tasks() -> list[str]:
@@ -87,13 +104,25 @@ def list_tasks() -> list[str]:
     return sorted(_tasks)
 
 
-def load_env_cfg(task_name: str, play: bool = False) -> ManagerBasedRlEnvCfg:
+def list_profiles(task_name: str) -> list[str]:
+    """Return the names of a task's profiles, sorted; raises UnknownTaskError for no such task."""
+    return sorted(_find(task_name).profiles)
+
+
+def load_env_cfg(
+    task_name: str, play: bool = False, profile: str | None = None
+) -> ManagerBasedRlEnvCfg:
     """Return a copy of the environment config of a task, to train or to `play` with.
+
+    `profile` names one of the task's profiles, which is applied to it; None applies none.
 
     Raises:
         UnknownTaskError: no such task.
+        UnknownProfileError: the task has no such profile.
         TaskImportError: the config's function is given by name and cannot be imported.
     """
+    if profile is not None:
+        return _with_profile(task_name, profile, play)[0]
     task = _find(task_name)
     if not play:
         return _made(task_name, task.env_cfg)
@@ -102,9 +131,52 @@ def load_env_cfg(task_name: str, play: bool = False) -> ManagerBasedRlEnvCfg:
     return _made(task_name, task.env_cfg, play=True)
 
 
-def load_rl_cfg(task_name: str) -> RslRlBaseRunnerCfg:
+def load_rl_cfg(task_name: str, profile: str | None = None) -> RslRlBaseRunnerCfg:
     """Return a copy of the learner's config of a task; raises as `load_env_cfg` does."""
+    if profile is not None:
+        return _with_profile(task_name, profile, play=False)[1]
     return _made(task_name, _find(task_name).rl_cfg)
+
+
+def _with_profile(
+    task_name: str, profile: str, play: bool
+) -> tuple[ManagerBasedRlEnvCfg, RslRlBaseRunnerCfg]:
+    """Return copies of both configs of a task as `profile` makes them."""
+    edit = require_profile(task_name, profile)
+    if isinstance(edit, str):
+        edit = _imported(task_name, edit)
+    env_cfg, rl_cfg = load_env_cfg(task_name, play), load_rl_cfg(task_name)
+    experiment = rl_cfg.experiment_name
+    returned = edit(env_cfg, rl_cfg)
+    named = f"The profile {profile!r} of task {task_name!r}"
+    if returned is not None:
+        raise ValueError(
+            f"{named} returns a {type(returned).__name__}; it has to edit the two configs that it "
+            "is given, and return nothing."
+        )
+    if rl_cfg.experiment_name != experiment:
+        raise ValueError(
+            f"{named} sets experiment_name to {rl_cfg.experiment_name!r}; it has to stay "
+            f"{experiment!r}, because that is where runs of the task are looked for."
+        )
+    return env_cfg, rl_cfg
+
+
+def require_profile(task_name: str, profile: str) -> Callable[[Any, Any], None] | str:
+    """Return what a profile was registered with.
+
+    Raises:
+        UnknownTaskError: no such task.
+        UnknownProfileError: no such profile; the message lists the task's.
+    """
+    profiles = _find(task_name).profiles
+    if profile in profiles:
+        return profiles[profile]
+    there = f"its profiles are: {', '.join(sorted(profiles))}" if profiles else "it has none"
+    raise UnknownProfileError(
+        f"Task {task_name!r} has no profile {profile!r}; {there}. Without --profile the task's "
+        "own settings are used."
+    )
 
 
 def load_runner_cls(task_name: str) -> type | None:

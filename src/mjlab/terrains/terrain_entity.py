@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
-from typing import Any, Literal, NoReturn
+from typing import Literal, NoReturn
 
 import mujoco
 import numpy as np
 import torch
 
 from mjlab.entity import Entity, EntityCfg
+from mjlab.terrains._debug_sites import add_debug_sites
 from mjlab.terrains.origins import assign_columns, grid_origins
+from mjlab.terrains.terrain_generator import TerrainGenerator, TerrainGeneratorCfg
 from mjlab.utils import spec_config as spec_cfg
 
 _SUN = spec_cfg.LightCfg(name="sun", type="directional", pos=(0.0, 0.0, 1.5))
@@ -47,7 +50,7 @@ class TerrainEntityCfg(EntityCfg):
     """Materials to add and to give to geoms."""
     terrain_type: Literal["generator", "plane"] = "plane"
     """`plane` is one infinite plane; `generator` makes a grid of sub-terrains."""
-    terrain_generator: Any | None = None
+    terrain_generator: TerrainGeneratorCfg | None = None
     """What `generator` makes."""
     env_spacing: float | None = 2.0
     """Distance between environments on a plane, in metres. A scene puts its own here."""
@@ -56,7 +59,8 @@ class TerrainEntityCfg(EntityCfg):
     num_envs: int = 1
     """Number of environments. A scene puts its own here."""
     debug_vis: bool = False
-    """Whether to add sites that show where environments start."""
+    """Whether to add sites that show where environments start, the spawn points of the terrain and
+    its flat patches."""
 
     def build(self) -> NoReturn:
         """Not offered, because a terrain also needs a device: use `TerrainEntity(cfg, device)`."""
@@ -66,10 +70,18 @@ class TerrainEntityCfg(EntityCfg):
         )
 
 
+def _without_plane(cfg: TerrainEntityCfg) -> TerrainEntityCfg:
+    """Return a copy whose default material is not looked for on a plane, which is not there."""
+    added_only = dataclasses.replace(_GROUND_MATERIAL, geom_names_expr=None)
+    materials = tuple(added_only if m == _GROUND_MATERIAL else m for m in cfg.materials)
+    return dataclasses.replace(cfg, materials=materials)
+
+
 class TerrainEntity(Entity):
     """The ground: one static body `terrain` of the world, and the environments' origins."""
 
-    _transient = {"_device"}
+    # The ground is built from the config; a checkpoint says where on it the environments are.
+    _transient = {"_device", "_flat_patches", "_flat_patch_radii"}
 
     cfg: TerrainEntityCfg
 
@@ -90,31 +102,62 @@ class TerrainEntity(Entity):
         """(N,) column of each environment; None on a plane."""
         self.max_terrain_level = 0
         """Number of levels; 0 on a plane."""
+        self.terrain_generator: TerrainGenerator | None = None
+        """What made the terrain; None on a plane."""
         self._flat_patches: dict[str, torch.Tensor] = {}
         self._flat_patch_radii: dict[str, float] = {}
-        super().__init__(cfg)
+        super().__init__(_without_plane(cfg) if cfg.terrain_type == "generator" else cfg)
 
     def _make_spec(self) -> mujoco.MjSpec:
-        if self.cfg.terrain_type == "plane":
-            return self._make_plane()
-        if self.cfg.terrain_type == "generator":
+        top = self.cfg.max_init_terrain_level
+        if top is not None and top < 0:
             raise ValueError(
-                "TerrainEntityCfg.terrain_type='generator' is not available in this release. Use "
-                "terrain_type='plane'."
+                f"TerrainEntityCfg.max_init_terrain_level is {top}; it must be 0 or more, or None "
+                "for all levels."
             )
-        raise ValueError(
-            f"TerrainEntityCfg.terrain_type is {self.cfg.terrain_type!r}; it must be 'plane' or "
-            "'generator'."
-        )
-
-    def _make_plane(self) -> mujoco.MjSpec:
+        if self.cfg.terrain_type not in ("plane", "generator"):
+            raise ValueError(
+                f"TerrainEntityCfg.terrain_type is {self.cfg.terrain_type!r}; it must be 'plane' "
+                "or 'generator'."
+            )
         spec = mujoco.MjSpec()
+        if self.cfg.terrain_type == "plane":
+            self._add_plane(spec)
+        else:
+            self._generate(spec)
+        if self.cfg.debug_vis:
+            add_debug_sites(
+                spec.body("terrain"),
+                self.env_origins,
+                self.terrain_origins,
+                self._flat_patches,
+                self._flat_patch_radii,
+            )
+        return spec
+
+    def _add_plane(self, spec: mujoco.MjSpec) -> None:
         body = spec.worldbody.add_body(name="terrain")
         body.add_geom(name="terrain", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 0.01))
         self.configure_env_origins()
-        if self.cfg.debug_vis:
-            self._add_debug_sites(body)
-        return spec
+
+    def _generate(self, spec: mujoco.MjSpec) -> None:
+        """Add the configured grid of sub-terrains and put the environments on it."""
+        if self.cfg.terrain_generator is None:
+            raise ValueError(
+                "TerrainEntityCfg.terrain_type is 'generator', but terrain_generator is None. Give "
+                "a TerrainGeneratorCfg, such as mjlab.terrains.config.ROUGH_TERRAINS_CFG."
+            )
+        generator = TerrainGenerator(self.cfg.terrain_generator, self._device)
+        generator.compile(spec)
+        self.terrain_generator = generator
+        self._flat_patches = {
+            name: torch.as_tensor(found, dtype=torch.float32, device=self._device)
+            for name, found in generator.flat_patches.items()
+        }
+        self._flat_patch_radii = dict(generator.flat_patch_radii)
+        # Elsewhere a column holds several kinds, even where there are as many columns as kinds.
+        shares = generator.proportions if generator.cfg.curriculum else None
+        self.configure_env_origins(generator.terrain_origins, shares)
 
     def _placeable(self, spec: mujoco.MjSpec) -> mujoco.MjSpec:
         # The ground stays where it is.
@@ -211,14 +254,3 @@ class TerrainEntity(Entity):
         if grid is not None and kept is not None and types is not None:
             kept[env_ids] = levels
             self.env_origins[env_ids] = grid[levels, types[env_ids]]
-
-    def _add_debug_sites(self, body: mujoco.MjsBody) -> None:
-        for index, position in enumerate(self.env_origins.tolist()):
-            body.add_site(
-                name=f"env_origin_{index}",
-                type=mujoco.mjtGeom.mjGEOM_SPHERE,
-                size=(0.3, 0.0, 0.0),
-                pos=position,
-                group=4,
-                rgba=(0.2, 0.6, 0.2, 0.3),
-            )

@@ -41,6 +41,17 @@ def select_gpus(
     return [available[index] for index in gpu_ids], len(gpu_ids)
 
 
+def egl_device_id(index: int) -> int | None:
+    """Return the number that EGL has for the GPU which torch calls `cuda:<index>`.
+
+    EGL numbers all GPUs of the machine, whichever are visible to CUDA. None where it cannot be told:
+    for an index out of range, and for GPUs that are named by strings, as MIG devices are.
+    """
+    available = _available_devices()
+    device = available[index] if 0 <= index < len(available) else None
+    return device if isinstance(device, int) else None
+
+
 def _available_devices() -> list[int | str]:
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     if visible is None:

@@ -73,6 +73,9 @@ from mjlab.managers.scene_entity_config import (
 from mjlab.sensor.builtin_sensor import (
     BuiltinSensor,
 )
+from mjlab.sensor.raycast_sensor import (
+    RayCastSensor,
+)
 from mjlab.utils.lab_api.math import (
     sample_uniform,
 )
@@ -87,6 +90,7 @@ __all__ = [
     "BuiltinSensor",
     "Entity",
     "NanGuard",
+    "RayCastSensor",
     "RewardCurriculumStage",
     "RewardTermCfg",
     "SceneEntityCfg",

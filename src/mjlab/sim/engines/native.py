@@ -24,6 +24,7 @@ from mjlab.sim.engines.field_lists import (
     INPUTS,
     ZERO_INPUTS,
 )
+from mjlab.sim.engines.native_rays import NativeRays
 from mjlab.sim.engines.sensor_fed import refuse_without_sensor
 
 if TYPE_CHECKING:
@@ -89,6 +90,7 @@ class NativeEngine(Engine):
         # Delays of MuJoCo's own actuators and sensors keep a history, which starts out not zero.
         self._history = _state_slice(self._model, mujoco.mjtState.mjSTATE_HISTORY)
         self._history0 = self._batch.bind("state")[0, self._history].copy()
+        self._rays: NativeRays | None = None
         threads = self._batch.num_threads
         self.capabilities = Capabilities(
             name="native",
@@ -233,28 +235,27 @@ class NativeEngine(Engine):
         directions: torch.Tensor,
         geom_groups: tuple[int, ...] | None,
         exclude_body_ids: torch.Tensor | None,
+        max_distances: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        shape = origins.shape[:2]
-        distances = np.empty(shape, dtype=np.float32)
-        normals = np.empty((*shape, 3), dtype=np.float32)
-        geom_ids = np.empty(shape, dtype=np.int32)
-        mask = None
-        if geom_groups is not None:
-            mask = np.zeros(6, dtype=np.uint8)
-            mask[list(geom_groups)] = 1
-        self._batch.rays(
-            np.ascontiguousarray(origins.numpy()),
-            np.ascontiguousarray(directions.numpy()),
-            distances,
-            geom_ids,
-            normals,
-            geomgroup=mask,
-            bodyexclude=None if exclude_body_ids is None else exclude_body_ids.numpy(),
+        if self._rays is None:
+            threads = self._batch.num_threads
+            self._rays = NativeRays(
+                self._model,
+                self._batch,
+                lambda model, count: mjbatch.Batch(model, count, threads),
+            )
+        hits = self._rays.cast(
+            origins,
+            directions,
+            geom_groups,
+            exclude_body_ids,
+            max_distances,
+            self._model_arrays.keys(),
         )
         return (
-            torch.from_numpy(distances),
-            torch.from_numpy(normals),
-            torch.from_numpy(geom_ids),
+            torch.from_numpy(hits.distances),
+            torch.from_numpy(hits.normals),
+            torch.from_numpy(hits.geoms),
         )
 
     def jacobian(

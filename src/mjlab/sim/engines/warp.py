@@ -34,8 +34,9 @@ from mjlab.sim.engines.field_lists import (
 )
 from mjlab.sim.engines.sensor_fed import refuse_without_sensor
 from mjlab.sim.engines.warp_fields import find_data_field, find_model_field
+from mjlab.sim.engines.warp_overflow import OverflowWatch, contacts_per_environment
+from mjlab.sim.engines.warp_rays import WarpRays
 from mjlab.sim.engines.warp_support import (
-    OverflowWatch,
     UnsupportedByWarpError,
     mocap_bodies,
     refuse_unsupported,
@@ -110,6 +111,7 @@ class WarpEngine(Engine):
         self._data_tensors: dict[str, torch.Tensor] = {}
         self._model_tensors: dict[str, torch.Tensor] = {}
         self._graphs: dict[str, Any] = {}
+        self._rays: WarpRays | None = None
         self._eq_active0 = torch.as_tensor(model.eq_active0.astype(bool), device=self.device)
         self._mocap_bodies = torch.as_tensor(
             mocap_bodies(model), dtype=torch.int64, device=self.device
@@ -121,9 +123,11 @@ class WarpEngine(Engine):
             as_torch(self.wp_data.overflow),
             {kind.name: int(kind) for kind in mjwarp.OverflowType},
             {
-                "nconmax": self.wp_data.naconmax // self.num_envs,
                 "njmax": self.wp_data.njmax,
+                "nconmax": self.wp_data.naconmax // self.num_envs,
+                "contact_sensor_maxmatch": cfg.contact_sensor_maxmatch,
             },
+            self._sizes_needed,
         )
         self.capabilities = Capabilities(
             name="warp",
@@ -366,6 +370,22 @@ class WarpEngine(Engine):
         """Log now, once a kind, what exceeded its capacity so far. Waits for the GPU."""
         self._overflow.check(wait=True)
 
+    def _sizes_needed(self) -> torch.Tensor:
+        """Return (3,): constraint rows and contacts per environment, and matches of a sensor.
+
+        No sensor can match more contacts than its environment has.
+        """
+        data = self.wp_data
+        rows, contacts = as_torch(data.nefc).amax(), as_torch(data.nacon)
+        pooled = torch.maximum(contacts, as_torch(data.ncollision))[0]
+        matches = contacts_per_environment(as_torch(data.contact.worldid), contacts, self.num_envs)
+        # Contacts are pooled, so only their mean has to fit. It is rounded up.
+        return torch.stack([rows, -(-pooled // self.num_envs), matches])
+
+    def close(self) -> None:
+        """Log what exceeded its capacity since the last look."""
+        self.check_overflow()
+
     # Queries.
 
     def raycast(
@@ -374,29 +394,18 @@ class WarpEngine(Engine):
         directions: torch.Tensor,
         geom_groups: tuple[int, ...] | None,
         exclude_body_ids: torch.Tensor | None,
+        max_distances: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        shape = tuple(origins.shape[:2])
-        distances = torch.empty(shape, device=self.device)
-        normals = torch.empty((*shape, 3), device=self.device)
-        geom_ids = torch.empty(shape, dtype=torch.int32, device=self.device)
-        if exclude_body_ids is None:
-            exclude_body_ids = torch.full(shape[1:], -1, dtype=torch.int32, device=self.device)
-        groups = [-1.0] * 6
-        if geom_groups is not None:
-            groups = [float(group in geom_groups) for group in range(6)]
-        with self._ordered():
-            mjwarp.rays(
-                self.wp_model,
-                self.wp_data,
-                wp.from_torch(origins.contiguous(), dtype=wp.vec3),
-                wp.from_torch(directions.contiguous(), dtype=wp.vec3),
-                wp.types.vector(length=6, dtype=float)(*groups),
-                True,
-                wp.from_torch(exclude_body_ids.to(torch.int32).contiguous()),
-                wp.from_torch(distances),
-                wp.from_torch(geom_ids),
-                wp.from_torch(normals, dtype=wp.vec3),
-            )
+        if self._rays is None:
+            self._rays = WarpRays(self._host.model, self.wp_model, self.wp_data, self._ordered)
+        distances, normals, geom_ids = self._rays.cast(
+            origins, directions, geom_groups, exclude_body_ids
+        )
+        if max_distances is not None:
+            missed = distances > max_distances
+            distances.masked_fill_(missed, -1.0)
+            normals.masked_fill_(missed[..., None], 0.0)
+            geom_ids.masked_fill_(missed, -1)
         return distances, normals, geom_ids
 
     def jacobian(

@@ -1,13 +1,11 @@
 """What the Warp engine needs that does not touch Warp itself.
 
-What MuJoCo Warp cannot do, found before a simulation is built; facts about the host model; and the
-watch over its fixed capacities.
+What MuJoCo Warp cannot do, found before a simulation is built, and facts about the host model.
 """
 
 from __future__ import annotations
 
-import logging
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -15,34 +13,6 @@ from mjlab.sim.engine import EngineUnavailableError
 
 if TYPE_CHECKING:
     import mujoco
-
-logger = logging.getLogger(__name__)
-
-# Dispatches of `step` between two looks at the overflow flags.
-_CHECK_PERIOD = 64
-
-OVERFLOW_MESSAGES: dict[str, str] = {
-    "NEFC": "more constraint rows than njmax={njmax}; the excess was dropped. Raise "
-    "SimulationCfg.njmax",
-    "NJMAX_NNZ": "the sparse constraint Jacobian outgrew njmax={njmax}; the excess was dropped. "
-    "Raise SimulationCfg.njmax",
-    "BROADPHASE": "more candidate collisions than nconmax={nconmax} per environment allows; the "
-    "excess was dropped. Raise SimulationCfg.nconmax",
-    "NARROWPHASE": "more contacts than nconmax={nconmax} per environment allows; the excess was "
-    "dropped. Raise SimulationCfg.nconmax",
-    "CCD": "more convex collisions than nconmax={nconmax} per environment allows; the excess was "
-    "dropped. Raise SimulationCfg.nconmax",
-    "HFIELD": "one geom touched more height-field cells than can be kept. Use a coarser height "
-    "field or smaller geoms",
-    "CONTACT_MATCH": "a contact sensor matched more contacts than it keeps. Raise "
-    "SimulationCfg.contact_sensor_maxmatch",
-    "NVMAX": "more active degrees of freedom than were allocated",
-    "EPA_HORIZON": "a deep penetration was resolved approximately. Reduce the time step or simplify "
-    "the collision geometry",
-    "TACTILE": "a tactile sensor met more geoms than it keeps",
-}
-"""By name of a `mujoco_warp.OverflowType`: what happened and what to change. Reaching an iteration
-limit of the solver is left out, because native MuJoCo does not report it either."""
 
 
 class UnsupportedByWarpError(EngineUnavailableError, NotImplementedError):
@@ -133,58 +103,3 @@ def rotation_matrices(quat: torch.Tensor) -> torch.Tensor:
     identity = torch.eye(3, device=quat.device)
     squared = (v * v).sum(dim=-1)[..., None, None]
     return identity + 2 * w * cross + 2 * (outer - squared * identity)
-
-
-class OverflowWatch:
-    """Logs, once a kind, that some environment exceeded a capacity, without waiting for the GPU.
-
-    Every so many steps the flags of all environments are gathered and copied to the host in the
-    background; they are read when they have arrived.
-    """
-
-    def __init__(
-        self, flags: torch.Tensor, bits: dict[str, int], capacities: dict[str, int]
-    ) -> None:
-        """Watch `flags` (N,), whose bits are named by `bits`; `capacities` go into the messages."""
-        self._flags = flags
-        self._capacities = capacities
-        self._kinds = [name for name in OVERFLOW_MESSAGES if name in bits]
-        self._reported: set[str] = set()
-        self._bits = torch.tensor([bits[name] for name in self._kinds], dtype=torch.int32)
-        self._arrived = torch.zeros(len(self._bits), dtype=torch.int32)
-        self._event: Any = None
-        if flags.is_cuda:
-            self._bits = self._bits.to(flags.device)
-            self._arrived = self._arrived.pin_memory()
-        self._steps = 0
-
-    def tick(self) -> None:
-        """Count a dispatch of `step`; look at the flags after the first and then now and then."""
-        self._steps += 1
-        if self._steps % _CHECK_PERIOD == 1:
-            self.check(wait=False)
-
-    def check(self, wait: bool) -> None:
-        """Log what has exceeded its capacity; without `wait`, what is known by now."""
-        if not self._flags.is_cuda:
-            self._arrived = self._gather()
-            self._report()
-            return
-        if self._event is None or wait:
-            self._arrived.copy_(self._gather(), non_blocking=True)
-            self._event = torch.cuda.current_stream(self._flags.device).record_event()
-            if wait:
-                self._event.synchronize()
-        if self._event.query():
-            self._event = None
-            self._report()
-
-    def _gather(self) -> torch.Tensor:
-        return (self._flags[:, None] & self._bits).amax(dim=0)
-
-    def _report(self) -> None:
-        for name, found in zip(self._kinds, self._arrived.tolist(), strict=True):
-            if found and name not in self._reported:
-                self._reported.add(name)
-                message = OVERFLOW_MESSAGES[name].format(**self._capacities)
-                logger.warning("MuJoCo Warp overflow in some environment: %s.", message)

@@ -37,11 +37,46 @@ class _Batch:
     scales: list[np.ndarray] = field(default_factory=list)
     colors: list[Color] = field(default_factory=list)
 
-    def add(self, position: np.ndarray, wxyz: np.ndarray, scale: np.ndarray, color: Color) -> None:
-        self.positions.append(np.asarray(position, dtype=np.float32).reshape(3))
-        self.wxyzs.append(np.asarray(wxyz, dtype=np.float32).reshape(4))
-        self.scales.append(np.asarray(scale, dtype=np.float32).reshape(3))
+    def add(self, position, wxyz, scale, color: Color) -> None:
+        self.positions.append(np.array(position, dtype=np.float32))
+        self.wxyzs.append(wxyz)
+        self.scales.append(scale)
         self.colors.append(color)
+
+    def extend(self, positions, wxyzs, scales, colors: list[Color]) -> None:
+        """Add a row of each array (n, ...) as an item."""
+        self.positions.extend(positions)
+        self.wxyzs.extend(wxyzs)
+        self.scales.extend(scales)
+        self.colors.extend(colors)
+
+
+@dataclass
+class _Arrows:
+    """Arrows of a frame. They are many, so that their directions are computed all at once."""
+
+    starts: list[np.ndarray] = field(default_factory=list)
+    ends: list[np.ndarray] = field(default_factory=list)
+    widths: list[float] = field(default_factory=list)
+    colors: list[Color] = field(default_factory=list)
+
+    def add_to(self, shafts: _Batch, heads: _Batch) -> None:
+        """Add what the arrows that have a direction consist of."""
+        starts = np.array(self.starts, dtype=float).reshape(-1, 3)
+        vectors = np.array(self.ends, dtype=float).reshape(-1, 3) - starts
+        lengths = np.linalg.norm(vectors, axis=1)
+        kept = np.flatnonzero(lengths >= MIN_LENGTH)
+        starts, lengths = starts[kept], lengths[kept, None]
+        axes = vectors[kept] / lengths
+        wxyzs = _rotations_of_z(axes)
+        widths = np.array(self.widths, dtype=float)[kept, None]
+        colors = [self.colors[i] for i in kept]
+        shaft, head = (1.0 - _HEAD_FRACTION) * lengths, _HEAD_FRACTION * lengths
+        shafts.extend(
+            starts + 0.5 * shaft * axes, wxyzs, np.hstack((widths, widths, shaft)), colors
+        )
+        radii = _HEAD_WIDENING * widths
+        heads.extend(starts + shaft * axes, wxyzs, np.hstack((radii, radii, head)), colors)
 
 
 class ViserDebugVisualizer(DebugVisualizer):
@@ -55,6 +90,7 @@ class ViserDebugVisualizer(DebugVisualizer):
         self._model = model
         self._meshes = _unit_meshes()
         self._batches: dict[str, _Batch] = {}
+        self._arrows = _Arrows()
         self._handles: dict[str, viser.BatchedMeshHandle] = {}
         self._ghosts: dict[int, tuple[mujoco.MjModel, mujoco.MjData, list[int]]] = {}
 
@@ -64,6 +100,7 @@ class ViserDebugVisualizer(DebugVisualizer):
 
     def clear(self) -> None:
         self._batches.clear()
+        self._arrows = _Arrows()
 
     def add_arrow(
         self,
@@ -73,14 +110,11 @@ class ViserDebugVisualizer(DebugVisualizer):
         width: float = 0.015,
         label: str | None = None,
     ) -> None:
-        start = np.asarray(start, dtype=float).reshape(3)
-        length, wxyz, axis = _direction(start, end)
-        if length < MIN_LENGTH:
-            return
-        shaft, head = (1.0 - _HEAD_FRACTION) * length, _HEAD_FRACTION * length
-        self._add("shaft", start + 0.5 * shaft * axis, wxyz, (width, width, shaft), color)
-        radius = _HEAD_WIDENING * width
-        self._add("head", start + shaft * axis, wxyz, (radius, radius, head), color)
+        arrows = self._arrows
+        arrows.starts.append(np.array(start, dtype=float))
+        arrows.ends.append(np.array(end, dtype=float))
+        arrows.widths.append(width)
+        arrows.colors.append(color)
 
     def add_cylinder(
         self,
@@ -149,6 +183,7 @@ class ViserDebugVisualizer(DebugVisualizer):
 
     def send(self, offset: np.ndarray) -> None:
         """Show this frame's items, moved by `offset` (3,), and hide what was not drawn again."""
+        self._batch_arrows()
         for key, batch in self._batches.items():
             self._send_batch(key, batch, offset)
         for key, handle in self._handles.items():
@@ -168,12 +203,23 @@ class ViserDebugVisualizer(DebugVisualizer):
             self._meshes[_ghost_key(model, geom_id)] = merge_geoms(model, [geom_id])
         return geom_ids
 
+    def _batch_arrows(self) -> None:
+        arrows, self._arrows = self._arrows, _Arrows()
+        if not arrows.starts:
+            return
+        shafts, heads = self._batches.get("shaft", _Batch()), _Batch()
+        arrows.add_to(shafts, heads)
+        if heads.positions:
+            self._batches["shaft"], self._batches["head"] = shafts, heads
+
     def _add(self, key: str, position, wxyz, scale, color: Color) -> None:
         self._batches.setdefault(key, _Batch()).add(position, wxyz, scale, color)
 
     def _send_batch(self, key: str, batch: _Batch, offset: np.ndarray) -> None:
-        positions = np.stack(batch.positions) + np.asarray(offset, dtype=np.float32)
-        wxyzs, scales = np.stack(batch.wxyzs), np.stack(batch.scales)
+        positions = np.array(batch.positions, dtype=np.float32).reshape(-1, 3)
+        positions += np.asarray(offset, dtype=np.float32)
+        wxyzs = np.array(batch.wxyzs, dtype=np.float32).reshape(-1, 4)
+        scales = np.array(batch.scales, dtype=np.float32).reshape(-1, 3)
         rgba = np.clip(np.array(batch.colors, dtype=np.float32), 0.0, 1.0)
         colors = (rgba[:, :3] * 255).astype(np.uint8)
         handle = self._handles.get(key)
@@ -234,4 +280,17 @@ def _direction(start: np.ndarray, end: np.ndarray) -> tuple[float, np.ndarray, n
     if length < MIN_LENGTH:
         return length, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
     axis = vector / length
-    return length, rotation_quat_from_vectors(np.array([0.0, 0.0, 1.0]), axis), axis
+    return length, _rotations_of_z(axis[None])[0], axis
+
+
+def _rotations_of_z(axes: np.ndarray) -> np.ndarray:
+    """Rotations (n, 4), w first, that turn z onto unit vectors (n, 3)."""
+    # Half way between no turn and twice the turn: 1 + z.a, and z x a.
+    wxyzs = np.zeros((len(axes), 4))
+    wxyzs[:, 0] = 1.0 + axes[:, 2]
+    wxyzs[:, 1], wxyzs[:, 2] = -axes[:, 1], axes[:, 0]
+    lengths = np.linalg.norm(wxyzs, axis=1)
+    # Straight down: half a turn about x.
+    opposite = lengths < 1e-8
+    wxyzs[opposite], lengths[opposite] = (0.0, 1.0, 0.0, 0.0), 1.0
+    return wxyzs / lengths[:, None]

@@ -234,9 +234,8 @@ class ViserPlayViewer(BaseViewer):
         with gui.add_folder("Debug Viz"):
             enabled = gui.add_checkbox("Enabled", scene.debug_enabled)
             all_envs = gui.add_checkbox("All envs", scene.show_all_debug, visible=env.num_envs > 1)
-            for manager in (env.command_manager, env.reward_manager):
-                if hasattr(manager, "create_debug_vis_gui"):
-                    manager.create_debug_vis_gui(self._server, scene.request_redraw)
+            for part in (*env.manager_visualizers.values(), env.sensor_visualizers):
+                part.create_debug_vis_gui(self._server, scene.request_redraw)
 
         @enabled.on_update
         def _(_: Any) -> None:

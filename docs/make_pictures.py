@@ -1,0 +1,122 @@
+"""Draw the pictures of the documentation: `python docs/make_pictures.py`.
+
+It renders offscreen and needs no display. Run it again when a terrain preset changes.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
+
+from mjlab.terrains import SubTerrainCfg, TerrainGenerator, TerrainGeneratorCfg
+from mjlab.terrains.config import ALL_TERRAIN_PRESETS
+from mjlab.viewer.gl_context import open_renderer
+
+_IMAGES = Path(__file__).parent / "images"
+
+# Extent of one terrain, in metres, and how difficult those of a strip are.
+_SIZE = 8.0
+_DIFFICULTIES = (0.0, 0.5, 1.0)
+_STRIPS_PER_ROW = 2
+# Pixels of a strip and of its title. Strips are rendered larger, and shrunk to smooth edges.
+_WIDTH, _HEIGHT, _TITLE, _OVERSAMPLING = 640, 168, 22, 2
+
+
+def main() -> None:
+    """Draw all pictures."""
+    draw_terrains(_IMAGES / "terrains.png")
+
+
+def draw_terrains(path: Path) -> None:
+    """Draw every terrain preset, from easy at the left to difficult at the right."""
+    strips = {name: render_strip(preset()) for name, preset in ALL_TERRAIN_PRESETS.items()}
+    rows = -(-len(strips) // _STRIPS_PER_ROW)
+    width, height = _STRIPS_PER_ROW * _WIDTH, rows * (_HEIGHT + _TITLE)
+    figure = Figure(figsize=(width / 100, height / 100), dpi=100)
+    for index, (name, pixels) in enumerate(strips.items()):
+        row, col = divmod(index, _STRIPS_PER_ROW)
+        top = 1.0 - row / rows
+        left, share = col / _STRIPS_PER_ROW, _TITLE / height
+        axis = figure.add_axes(
+            (left, top - share - _HEIGHT / height, _WIDTH / width, _HEIGHT / height)
+        )
+        axis.imshow(pixels, aspect="auto")
+        axis.axis("off")
+        figure.text(
+            left + 0.5 / _STRIPS_PER_ROW, top - 1.2 * share, name,
+            ha="center", va="bottom", fontsize=13, family="monospace",
+        )  # fmt: skip
+    figure.text(
+        0.75, 0.5 / rows, "from left to right:\ndifficulty 0, 0.5 and 1,\n8 m x 8 m each",
+        ha="center", va="center", fontsize=13, color="0.3",
+    )  # fmt: skip
+    figure.savefig(path)
+    # A palette of 256 colours is a third of the size, and looks the same here.
+    image = Image.open(path).convert("RGB")
+    image.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
+    print(f"{path}: {path.stat().st_size // 1024} kB, {image.size[0]} x {image.size[1]}")
+
+
+def render_strip(sub: SubTerrainCfg) -> np.ndarray:
+    """Return (height, width, 3) of one kind of terrain at all difficulties."""
+    model = _strip_spec(sub).compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    camera = mujoco.MjvCamera()
+    camera.lookat = (0.0, 0.6, 0.0)
+    camera.distance, camera.azimuth, camera.elevation = 46.0, 90.0, -36.0
+    with open_renderer(model, _HEIGHT * _OVERSAMPLING, _WIDTH * _OVERSAMPLING) as renderer:
+        renderer.update_scene(data, camera)
+        pixels = renderer.render()
+    small = Image.fromarray(pixels).resize((_WIDTH, _HEIGHT), Image.Resampling.LANCZOS)
+    return np.asarray(small)
+
+
+def _strip_spec(sub: SubTerrainCfg) -> mujoco.MjSpec:
+    """Return a scene with one kind of terrain at all difficulties, lit from the left."""
+    spec = mujoco.MjSpec()
+    generator = TerrainGeneratorCfg(
+        seed=0,
+        curriculum=True,
+        size=(_SIZE, _SIZE),
+        num_rows=len(_DIFFICULTIES),
+        difficulty_range=(_DIFFICULTIES[0], _DIFFICULTIES[-1]),
+        border_width=0.4,
+        border_height=0.6,
+        sub_terrains={"shown": sub},
+    )
+    TerrainGenerator(generator).compile(spec)
+    spec.worldbody.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=(-10.0, -8.0, 20.0),
+        dir=(0.6, 0.3, -0.74),
+        diffuse=(0.8, 0.8, 0.78),
+        specular=(0.0, 0.0, 0.0),
+        castshadow=True,
+    )
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=(1.0, 1.0, 1.0),
+        width=16,
+        height=96,
+    )
+    visual = spec.visual
+    visual.headlight.ambient = (0.36, 0.36, 0.38)
+    visual.headlight.diffuse = (0.1, 0.1, 0.1)
+    visual.headlight.specular = (0.0, 0.0, 0.0)
+    visual.quality.shadowsize = 8192
+    # A narrow view from afar: all three look alike, wherever they are in the strip.
+    visual.global_.fovy = 9.1
+    visual.global_.offwidth = _WIDTH * _OVERSAMPLING
+    visual.global_.offheight = _HEIGHT * _OVERSAMPLING
+    return spec
+
+
+if __name__ == "__main__":
+    main()

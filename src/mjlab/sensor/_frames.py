@@ -1,0 +1,84 @@
+"""Frames of the scene that a sensor is attached to: bodies, sites and geoms."""
+
+from __future__ import annotations
+
+import difflib
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import torch
+
+from mjlab.sensor.builtin_sensor import ObjRef
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+
+# Kind of frame: fields of MjData with position and orientation, and MuJoCo's type of the object.
+_KINDS = {
+    "body": ("xpos", "xmat", mujoco.mjtObj.mjOBJ_BODY),
+    "site": ("site_xpos", "site_xmat", mujoco.mjtObj.mjOBJ_SITE),
+    "geom": ("geom_xpos", "geom_xmat", mujoco.mjtObj.mjOBJ_GEOM),
+}
+_PLURALS = {"body": "bodies", "site": "sites", "geom": "geoms"}
+
+
+def check_frames(frames: tuple[ObjRef, ...], spec: mujoco.MjSpec, entities: dict[str, Entity]):
+    """Raise ValueError unless all `frames` are bodies, sites or geoms that the spec has."""
+    if not frames:
+        raise ValueError("frame is empty; give one ObjRef or several.")
+    for frame in frames:
+        if frame.type not in _KINDS:
+            raise ValueError(
+                f"frame {frame.name!r} is of type {frame.type!r}; rays start at a body, a site or "
+                "a geom."
+            )
+        if frame.entity and frame.entity not in entities:
+            raise ValueError(
+                f"frame {frame.name!r} refers to the entity {frame.entity!r}. The scene has: "
+                f"{sorted(entities)}."
+            )
+        prefix = f"{frame.entity}/" if frame.entity else ""
+        names = [element.name for element in getattr(spec, _PLURALS[frame.type])]
+        if not frame.name or frame.prefixed_name() not in names:
+            own = [n.removeprefix(prefix) for n in names if n and n.startswith(prefix)]
+            close = difflib.get_close_matches(frame.name, own, n=3)
+            hint = f"Close names: {', '.join(close)}." if close else f"It has: {own}."
+            owner = f"Entity {frame.entity!r}" if frame.entity else "The scene"
+            raise ValueError(f"{owner} has no {frame.type} {frame.name!r}. {hint}")
+
+
+class Frames:
+    """Poses of several frames, in the order in which they were given."""
+
+    def __init__(
+        self, frames: tuple[ObjRef, ...], mj_model: mujoco.MjModel, data: Any, device: str
+    ) -> None:
+        self._data = data
+        self._parts: list[tuple[str, str, torch.Tensor, torch.Tensor]] = []
+        self.body_ids: list[int] = []
+        """The body that carries each frame."""
+        ids = []
+        for frame in frames:
+            index = mujoco.mj_name2id(mj_model, _KINDS[frame.type][2], frame.prefixed_name())
+            ids.append(index)
+            owners = {"site": mj_model.site_bodyid, "geom": mj_model.geom_bodyid}
+            self.body_ids.append(index if frame.type == "body" else int(owners[frame.type][index]))
+        for kind in dict.fromkeys(frame.type for frame in frames):
+            places = [i for i, frame in enumerate(frames) if frame.type == kind]
+            self._parts.append(
+                (
+                    *_KINDS[kind][:2],
+                    torch.tensor(places, device=device),
+                    torch.tensor([ids[i] for i in places], device=device),
+                )
+            )
+
+    def read(self, pos: torch.Tensor, mat: torch.Tensor) -> None:
+        """Copy current positions into `pos` (N, F, 3) and orientations into `mat` (N, F, 3, 3)."""
+        for pos_field, mat_field, places, ids in self._parts:
+            for out, field in ((pos, pos_field), (mat, mat_field)):
+                values = getattr(self._data, field).index_select(1, ids)
+                if len(self._parts) == 1:
+                    out.copy_(values)
+                else:
+                    out.index_copy_(1, places, values)

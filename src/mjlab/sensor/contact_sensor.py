@@ -1,0 +1,396 @@
+"""Contact sensors: what touches what, how hard, where, and for how long."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import mujoco
+import torch
+
+from mjlab.sensor._contact_clocks import ContactClocks
+from mjlab.sensor._contact_debug import draw_contacts
+from mjlab.sensor._contact_layout import FIELD_SIZES, ContactLayout, to_world
+from mjlab.sensor._contact_names import Matched, find_matches
+from mjlab.sensor.sensor import Sensor, SensorCfg
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+    from mjlab.viewer.debug_visualizer import DebugVisualizer
+
+MatchMode = Literal["geom", "body", "subtree"]
+Reduction = Literal["none", "mindist", "maxforce", "netforce"]
+SecondaryPolicy = Literal["first", "any", "error"]
+
+_OBJECT_TYPES = {
+    "geom": mujoco.mjtObj.mjOBJ_GEOM,
+    "body": mujoco.mjtObj.mjOBJ_BODY,
+    "subtree": mujoco.mjtObj.mjOBJ_XBODY,
+}
+_HISTORY_FIELDS = ("force", "torque", "dist")
+# What drawing needs, whether or not the user asked for it.
+_DEBUG_FIELDS = ("found", "force", "pos", "normal", "tangent")
+
+
+@dataclass
+class ContactMatch:
+    """Elements of the scene whose contacts are meant."""
+
+    mode: MatchMode
+    """What the names are of: `geom`, `body` (all geoms of that body), `subtree` (all geoms of that
+    body and of the bodies below it)."""
+    pattern: str | tuple[str, ...]
+    """With `entity`: regular expressions that must match a whole name in the entity. A name inside
+    an attached part, such as `left/elbow`, is matched as `left/elbow` and as `elbow`. Without
+    `entity`: full names in the scene, taken literally."""
+    entity: str | None = None
+    """The entity, `terrain` included; None looks in the whole scene."""
+    exclude: tuple[str, ...] = ()
+    """Names of the entity to leave out of what `pattern` matches. An entry with any of
+    `.*+?[]{}()\\|^$` is a regular expression that is searched in the name, others are exact."""
+
+    def __post_init__(self) -> None:
+        if self.mode not in get_args(MatchMode):
+            raise ValueError(
+                f"ContactMatch.mode is {self.mode!r}; choose from: {', '.join(get_args(MatchMode))}."
+            )
+        if not self.patterns or "" in self.patterns:
+            raise ValueError(f"ContactMatch.pattern is {self.pattern!r}; it must name something.")
+
+    @property
+    def patterns(self) -> tuple[str, ...]:
+        """The patterns, also where there is only one."""
+        return (self.pattern,) if isinstance(self.pattern, str) else tuple(self.pattern)
+
+
+@dataclass(kw_only=True)
+class ContactSensorCfg(SensorCfg):
+    """Describes a sensor of the contacts of some elements, with anything or with one other element.
+
+    Every primary has `num_slots` slots, into which `reduce` sorts its contacts. Empty slots are
+    zero.
+    """
+
+    primary: ContactMatch
+    """Whose contacts are sensed: each element that matches is one primary."""
+    secondary: ContactMatch | None = None
+    """What they have to be with, one pattern; None for anything."""
+    fields: tuple[str, ...] = ("found", "force")
+    """What to measure, of: found, force, torque, dist, pos, normal, tangent."""
+    reduce: Reduction = "maxforce"
+    """Which contacts fill the slots: `none` any of them, in no order to rely on; `mindist` the
+    deepest; `maxforce` the strongest; `netforce` one sum of all, in the world frame."""
+    num_slots: int = 1
+    """Contacts reported for each primary."""
+    secondary_policy: SecondaryPolicy = "first"
+    """If the secondary pattern matches several elements: take the `first`, ignore the secondary and
+    sense contacts with `any`thing, or raise an `error`."""
+    track_air_time: bool = False
+    """Measure how long each primary has been in contact and in the air. Needs the field found."""
+    global_frame: bool = False
+    """Rotate force and torque from each contact's frame into the world frame. Needs the fields
+    normal and tangent. The sum of `netforce` is in the world frame anyway."""
+    history_length: int = 0
+    """Number of physics substeps for which force, torque and dist are kept; 0 for none."""
+    debug: bool = False
+    """Draw contact points and forces in the viewers."""
+
+    def __post_init__(self) -> None:
+        self._check_choice("reduce", self.reduce, get_args(Reduction))
+        self._check_choice("secondary_policy", self.secondary_policy, get_args(SecondaryPolicy))
+        if not self.fields or len(set(self.fields)) != len(self.fields):
+            self._refuse(f"fields={self.fields!r} must name at least one field, and none twice")
+        for name in self.fields:
+            self._check_choice("fields", name, tuple(FIELD_SIZES))
+        if self.num_slots < 1:
+            self._refuse(f"num_slots={self.num_slots} must be at least 1")
+        if self.history_length < 0:
+            self._refuse(f"history_length={self.history_length} must not be negative")
+        if self.track_air_time and "found" not in self.fields:
+            self._refuse("track_air_time=True needs 'found' among the fields")
+        if self.secondary is not None and len(self.secondary.patterns) != 1:
+            self._refuse(f"secondary.pattern={self.secondary.pattern!r} must be one string")
+        self._check_global_frame()
+
+    def _check_global_frame(self) -> None:
+        if not self.global_frame:
+            return
+        if self.reduce == "netforce":
+            self._refuse(
+                "global_frame=True cannot be combined with reduce='netforce', whose sum is in the "
+                "world frame already; leave global_frame out"
+            )
+        missing = [name for name in ("normal", "tangent") if name not in self.fields]
+        if missing:
+            self._refuse(f"global_frame=True needs {' and '.join(missing)} among the fields")
+
+    def _check_choice(self, field: str, value: str, allowed: tuple[str, ...]) -> None:
+        if value not in allowed:
+            self._refuse(f"{field} has {value!r}; choose from: {', '.join(allowed)}")
+
+    def _refuse(self, problem: str) -> None:
+        raise ValueError(f"Contact sensor {self.name!r}: {problem}.")
+
+    def build(self) -> ContactSensor:
+        """Build the sensor."""
+        return ContactSensor(self)
+
+
+@dataclass
+class ContactData:
+    """What a contact sensor measures, in N environments; None where it was not asked for.
+
+    Column i S + s is slot s of primary i, with P primaries of S slots each. All belong to the
+    simulation's derived quantities: one substep old after a step, current after `forward`. Forces
+    and torques are what the primary does to the secondary.
+    """
+
+    found: torch.Tensor | None = None
+    """(N, P S) number of contacts that match, in each slot that is filled; 0 in empty ones."""
+    force: torch.Tensor | None = None
+    """(N, P S, 3) force in N, in the contact frame (normal, tangent, normal x tangent); in the world
+    frame for `netforce` and `global_frame`."""
+    torque: torch.Tensor | None = None
+    """(N, P S, 3) torque in N m, in the same frame."""
+    dist: torch.Tensor | None = None
+    """(N, P S) distance in m; negative where they penetrate."""
+    pos: torch.Tensor | None = None
+    """(N, P S, 3) contact point in the world, m."""
+    normal: torch.Tensor | None = None
+    """(N, P S, 3) unit vector in the world, from the primary to the secondary."""
+    tangent: torch.Tensor | None = None
+    """(N, P S, 3) unit vector in the world, the second axis of the contact frame."""
+    current_air_time: torch.Tensor | None = None
+    """(N, P) time since the primary left, s; 0 in contact."""
+    last_air_time: torch.Tensor | None = None
+    """(N, P) length of the last phase of air that has ended, s."""
+    current_contact_time: torch.Tensor | None = None
+    """(N, P) time since the primary touched, s; 0 in the air."""
+    last_contact_time: torch.Tensor | None = None
+    """(N, P) length of the last phase of contact that has ended, s."""
+    force_history: torch.Tensor | None = None
+    """(N, P S, H, 3) force after each of the last H substeps, the newest first."""
+    torque_history: torch.Tensor | None = None
+    """(N, P S, H, 3) torque, likewise."""
+    dist_history: torch.Tensor | None = None
+    """(N, P S, H) distance, likewise."""
+
+
+class ContactSensor(Sensor[ContactData]):
+    """Senses contacts by MuJoCo's contact sensors, on either engine.
+
+    For every primary it adds one MuJoCo sensor `<sensor>_<primary>`, which measures all fields: one
+    for each field would cost both engines as much again. They lie side by side in `sensordata`, so
+    that all reading and recording is of one block.
+    """
+
+    _transient = {
+        "_primary_names", "_layout", "_fields", "_records", "_sim_data", "_source", "_found_view", "_slots", "_orders",
+    }  # fmt: skip
+
+    def __init__(self, cfg: ContactSensorCfg) -> None:
+        super().__init__()
+        self.cfg = cfg
+        drawn = _DEBUG_FIELDS if cfg.debug else ()
+        self._fields = tuple(dict.fromkeys((*cfg.fields, *drawn)))
+        self._records = cfg.history_length > 0 and any(f in cfg.fields for f in _HISTORY_FIELDS)
+        self._primary_names: list[str] = []
+        self._layout = ContactLayout(self._fields, 0, cfg.num_slots)
+        self._sim_data: Any = None
+        self._source: torch.Tensor | None = None
+        self._found_view: torch.Tensor | None = None
+        # Raw blocks of the last substeps; `_head` is the newest, older ones follow it cyclically.
+        self._ring: torch.Tensor | None = None
+        self._head = 0
+        self._slots: list[torch.Tensor] = []
+        self._orders: list[torch.Tensor] = []
+        self._clocks: ContactClocks | None = None
+
+    @property
+    def primary_names(self) -> list[str]:
+        """Names of the primaries, in the order of the data, without the prefix of their entity."""
+        return list(self._primary_names)
+
+    @property
+    def needs_substep(self) -> bool:
+        """Whether contacts between substeps count: for a history and for air time they do."""
+        return self._records or self.cfg.track_air_time
+
+    # Building.
+
+    def edit_spec(self, scene_spec: mujoco.MjSpec, entities: dict[str, Entity]) -> None:
+        """Add the MuJoCo sensors.
+
+        Raises:
+            ValueError: a pattern matches nothing, or, under the policy `error`, several secondary
+                elements; or the spec has a sensor of one of the names.
+        """
+        cfg = self.cfg
+        primaries = find_matches(cfg.name, "primary", cfg.primary, scene_spec, entities)
+        secondary = self._find_secondary(scene_spec, entities)
+        self._primary_names = [primary.name for primary in primaries]
+        self._layout = ContactLayout(self._fields, len(primaries), cfg.num_slots)
+        taken = {sensor.name for sensor in scene_spec.sensors}
+        names = (cfg.name, *map(self._element_name, self._primary_names))
+        if clashes := sorted(taken.intersection(names)):
+            raise ValueError(
+                f"Contact sensor {cfg.name!r}: the scene already has MuJoCo sensors of the names "
+                f"{clashes}. Rename this sensor."
+            )
+        for primary in primaries:
+            self._add_element(scene_spec, primary, secondary)
+
+    def _find_secondary(
+        self, scene_spec: mujoco.MjSpec, entities: dict[str, Entity]
+    ) -> Matched | None:
+        cfg = self.cfg
+        if cfg.secondary is None or cfg.secondary_policy == "any":
+            return None
+        found = find_matches(cfg.name, "secondary", cfg.secondary, scene_spec, entities)
+        if len(found) > 1 and cfg.secondary_policy == "error":
+            raise ValueError(
+                f"Contact sensor {cfg.name!r}: secondary pattern {cfg.secondary.pattern!r} matches "
+                f"{[one.name for one in found]}. Narrow it to one, or set secondary_policy to "
+                "'first' or 'any'."
+            )
+        return found[0]
+
+    def _element_name(self, primary: str) -> str:
+        return f"{self.cfg.name}_{primary}"
+
+    def _add_element(
+        self, scene_spec: mujoco.MjSpec, primary: Matched, secondary: Matched | None
+    ) -> None:
+        cfg = self.cfg
+        element = scene_spec.add_sensor(
+            name=self._element_name(primary.name), type=mujoco.mjtSensor.mjSENS_CONTACT
+        )
+        element.objtype = _OBJECT_TYPES[cfg.primary.mode]
+        element.objname = primary.full_name
+        if secondary is not None and cfg.secondary is not None:
+            element.reftype = _OBJECT_TYPES[cfg.secondary.mode]
+            element.refname = secondary.full_name
+        # MuJoCo numbers its reductions in this order.
+        reduction = get_args(Reduction).index(cfg.reduce)
+        element.intprm[:3] = [self._layout.field_bits, reduction, cfg.num_slots]
+
+    def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
+        """Find the sensor's block of `sensordata`, and start history and clocks."""
+        cfg = self.cfg
+        first = mj_model.sensor(self._element_name(self._primary_names[0]))
+        self._layout.start = int(first.adr[0])
+        self._sim_data = data
+        self._source = self._found_view = None
+        num_envs = data.qpos.shape[0]
+        if self._records:
+            length = cfg.history_length
+            self._ring = torch.zeros(length, num_envs, self._layout.width, device=device)
+            self._slots = list(self._ring.unbind())
+            slots = torch.arange(length, device=device)
+            self._orders = [slots.roll(-head) for head in range(length)]
+        if cfg.track_air_time:
+            self._clocks = ContactClocks(num_envs, len(self._primary_names), device)
+        if self.needs_substep:
+            # Read in the middle of a step for the first time, it would show a newer state than it
+            # does from then on.
+            self._block()
+
+    # Life cycle.
+
+    def update(self, dt: float) -> None:
+        """Record what the last physics substep, of `dt` seconds, has measured."""
+        self.invalidate_cache()
+        if self._ring is not None:
+            self._head = (self._head - 1) % len(self._slots)
+            self._slots[self._head].copy_(self._block())
+        if self._clocks is not None:
+            self._clocks.update(self._found() > 0.0, dt)
+
+    def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
+        """Clear history and clocks of these environments; None means all."""
+        self.invalidate_cache()
+        rows = slice(None) if env_ids is None else env_ids
+        if self._ring is not None:
+            self._ring[:, rows] = 0.0
+        if self._clocks is not None:
+            self._clocks.reset(rows)
+
+    # Reading.
+
+    def _block(self) -> torch.Tensor:
+        """Return the live (N, width) view of the sensor's part of `sensordata`."""
+        if self._source is None:
+            # Asking for `sensordata` makes the engine copy it out, so only a sensor in use does.
+            end = self._layout.start + self._layout.width
+            self._source = self._sim_data.sensordata[:, self._layout.start : end]
+        return self._source
+
+    def _found(self) -> torch.Tensor:
+        """Return the live (N, P) view of the number of contacts of each primary."""
+        if self._found_view is None:
+            self._found_view = self._layout.found_first(self._block())
+        return self._found_view
+
+    def _compute_data(self) -> ContactData:
+        # A copy, so that what a term keeps of one step does not change in the next.
+        values = self._fields_of(self._block().clone())
+        data = ContactData(**{name: values[name] for name in self.cfg.fields})
+        if self._ring is not None:
+            recorded = self._fields_of(self._ring.index_select(0, self._orders[self._head]))
+            for name in _HISTORY_FIELDS:
+                if name in self.cfg.fields:
+                    setattr(data, f"{name}_history", recorded[name].movedim(0, 2))
+        if self._clocks is not None:
+            (
+                data.current_air_time,
+                data.current_contact_time,
+                data.last_air_time,
+                data.last_contact_time,
+            ) = self._clocks.in_single_precision()
+        return data
+
+    def _fields_of(self, block: torch.Tensor) -> dict[str, torch.Tensor]:
+        values = self._layout.split(block)
+        if self.cfg.global_frame:
+            for name in ("force", "torque"):
+                if name in values:
+                    values[name] = to_world(values[name], values["normal"], values["tangent"])
+        return values
+
+    def compute_first_contact(self, dt: float, abs_tol: float = 1e-6) -> torch.Tensor:
+        """Return (N, P) bool: whether each primary has touched within the last `dt` seconds.
+
+        Asked once in every environment step, with its length, it tells of each landing once.
+
+        Raises:
+            RuntimeError: the sensor does not track air time.
+        """
+        contact = self._tracked("compute_first_contact").contact
+        return (contact > 0.0) & (contact < dt + abs_tol)
+
+    def compute_first_air(self, dt: float, abs_tol: float = 1e-6) -> torch.Tensor:
+        """Return (N, P) bool: whether each primary has left within the last `dt` seconds.
+
+        Raises:
+            RuntimeError: the sensor does not track air time.
+        """
+        air = self._tracked("compute_first_air").air
+        return (air > 0.0) & (air < dt + abs_tol)
+
+    def _tracked(self, method: str) -> ContactClocks:
+        if self._clocks is None:
+            raise RuntimeError(
+                f"Contact sensor {self.cfg.name!r}: {method} needs air times. Set "
+                "ContactSensorCfg.track_air_time=True (and initialize the scene)."
+            )
+        return self._clocks
+
+    @property
+    def draws(self) -> bool:
+        """Whether viewers draw the contacts, as the config says."""
+        return self.cfg.debug
+
+    def debug_vis(self, visualizer: DebugVisualizer) -> None:
+        """Draw contact points and forces, where the config says `debug`."""
+        if self.cfg.debug:
+            draw_contacts(visualizer, self._layout.split(self._block()), self.cfg)

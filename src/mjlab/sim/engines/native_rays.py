@@ -1,0 +1,213 @@
+"""Casting rays on the native engine: what `Engine.raycast` promises, at a speed of its own.
+
+`mj_ray` tries every geom of the model for every ray, and on generated terrain these are hundreds.
+So rays are cast against the geoms that never move in further batches, whose simulations hold only
+the few geoms that are near (`native_ray_nearby`). Their numbers are the same, hence the results.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+
+from mjlab.sim.engines.native_ray_casting import Hits, cast_through
+from mjlab.sim.engines.native_ray_culling import CullingRule
+from mjlab.sim.engines.native_ray_nearby import NearbyRays, cluster_rays
+from mjlab.sim.engines.native_ray_tiles import (
+    StaticGeoms,
+    is_static,
+    is_welded,
+    movable_kind,
+    static_geoms,
+    visible_geoms,
+)
+
+Array = np.ndarray
+MakeBatch = Callable[[mujoco.MjModel, int], Any]
+
+# Fewer static geoms than this are tried faster than they are looked up.
+_MIN_GEOMS = 12
+# Windows that reach farther (metres) hold most of the geoms anyway.
+_MAX_MARGIN = 4.0
+# If more of the environments than this have rays that left their window, windows are made larger.
+_MAX_STRAYS = 0.02
+
+# Where one of these differs between environments, so may the geoms that never move.
+_STATIC_FIELDS = frozenset(
+    {
+        "geom_pos", "geom_quat", "geom_size", "geom_dataid", "geom_group", "geom_rgba",
+        "geom_matid", "mat_rgba", "body_pos", "body_quat",
+    }
+)  # fmt: skip
+
+
+class NativeRays:
+    """Casts the rays of a native engine."""
+
+    def __init__(self, model: mujoco.MjModel, batch: Any, make_batch: MakeBatch) -> None:
+        """Cast in `batch`; `make_batch(model, count)` makes further batches."""
+        self._model, self._batch, self._make_batch = model, batch, make_batch
+        self._host = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, self._host)
+        self._rule = CullingRule(model, self._host.geom_xpos, self._host.geom_xmat)
+        self._plans: dict[Any, _Plan] = {}
+
+    def cast(
+        self,
+        origins: torch.Tensor,
+        directions: torch.Tensor,
+        geom_groups: tuple[int, ...] | None,
+        exclude_body_ids: torch.Tensor | None,
+        max_distances: torch.Tensor | None,
+        expanded: Collection[str],
+    ) -> Hits:
+        """Cast rays (N, R); see `Engine.raycast`.
+
+        `expanded` are the names of the model fields that differ between environments.
+        """
+        excluded = None
+        if exclude_body_ids is not None:
+            excluded = np.ascontiguousarray(exclude_body_ids.numpy().astype(np.int32))
+        rays = origins.shape[1]
+        key = (geom_groups, rays, None if excluded is None else excluded.tobytes())
+        if key not in self._plans:
+            self._plans[key] = _Plan(self._model, self._host, self._rule, geom_groups, excluded)
+        plan = self._plans[key]
+        hits = Hits.empty(len(origins), rays)
+        # A query that is made once is not worth a plan.
+        if plan.is_new or plan.nearby is None or not _STATIC_FIELDS.isdisjoint(expanded):
+            self._cast_all(plan, origins, directions, hits)
+        else:
+            self._cast_nearby(plan, origins, directions, max_distances, hits)
+        plan.is_new = False
+        if max_distances is not None:
+            too_far = hits.distances > max_distances.numpy()
+            if too_far.any():
+                hits.forget(too_far)
+        return hits
+
+    def _cast_all(
+        self,
+        plan: _Plan,
+        origins: torch.Tensor,
+        directions: torch.Tensor,
+        hits: Hits,
+        envs: Array | None = None,
+        static: bool = True,
+    ) -> None:
+        """Cast against the geoms of the model itself, in the environments `envs` (None: all)."""
+
+        def passed(rows: Any, origins: Array, directions: Array, hits: Hits) -> Array:
+            return self._rule.passed(
+                origins, directions, hits.distances, hits.normals, hits.geoms
+            )
+
+        cast_through(
+            self._batch,
+            np.ascontiguousarray(origins.numpy()),
+            np.ascontiguousarray(directions.numpy()),
+            hits,
+            passed if plan.is_one_sided else None,
+            envs,
+            geomgroup=plan.mask,
+            bodyexclude=plan.excluded,
+            flg_static=static,
+        )
+
+    def _cast_nearby(
+        self,
+        plan: _Plan,
+        origins: torch.Tensor,
+        directions: torch.Tensor,
+        reach: torch.Tensor | None,
+        hits: Hits,
+    ) -> None:
+        """Cast against the static geoms that are near, and then against those that move."""
+        if not plan.parts:
+            self._build(plan, origins, directions, reach)
+        if plan.nearby is None:
+            self._cast_all(plan, origins, directions, hits)
+            return
+        strayed = np.zeros(len(origins), dtype=bool)
+        for part in plan.parts:
+            strayed |= part.cast(origins, directions, reach, hits)
+        if plan.has_moving:
+            moving = Hits.empty(*hits.distances.shape)
+            self._cast_all(plan, origins, directions, moving, static=False)
+            hits.take_nearer(moving)
+        if strayed.any():
+            self._cast_all(plan, origins, directions, hits, np.flatnonzero(strayed))
+            if strayed.mean() > _MAX_STRAYS:
+                plan.parts.clear()
+
+    def _build(
+        self,
+        plan: _Plan,
+        origins: torch.Tensor,
+        directions: torch.Tensor,
+        reach: torch.Tensor | None,
+    ) -> None:
+        """Sort the rays into clusters, with windows that fit where they are now and some more."""
+        limit = np.full(origins.shape[1], np.inf) if reach is None else reach.numpy()
+        excluded = np.full(len(limit), -1) if plan.excluded is None else plan.excluded
+        _, sources = np.unique(np.stack((limit, excluded)), axis=1, return_inverse=True)
+        ends = (origins + (directions * torch.from_numpy(limit)[:, None]).nan_to_num()).numpy()
+        starts = origins.numpy()
+        plan.slack *= 1.5
+        for clusters in cluster_rays(starts[0], sources.reshape(-1)):
+            extents = []
+            for rays in clusters:
+                points = np.concatenate((starts[:, rays, :2], ends[:, rays, :2]), axis=1)
+                extents.append(np.linalg.norm(np.ptp(points, axis=1) / 2, axis=-1))
+            margin = plan.slack * float(np.quantile(extents, 0.99)) + 0.02
+            if not margin < _MAX_MARGIN:
+                plan.nearby = None
+                return
+            assert plan.nearby is not None
+            plan.parts.append(
+                NearbyRays(
+                    clusters,
+                    len(starts),
+                    plan.nearby,
+                    margin,
+                    self._make_batch,
+                    self._model,
+                    self._rule if plan.is_one_sided else None,
+                )
+            )
+
+
+class _Plan:
+    """How to cast rays against the geoms of some groups, as far as it is the same in every call."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        host: mujoco.MjData,
+        rule: CullingRule,
+        groups: tuple[int, ...] | None,
+        excluded: Array | None,
+    ) -> None:
+        self.mask = None
+        if groups is not None:
+            self.mask = np.zeros(6, dtype=np.uint8)
+            self.mask[list(groups)] = 1
+        self.excluded = excluded
+        visible = visible_geoms(model, groups)
+        self.is_one_sided = rule.concerns(visible)
+        self.is_new = True
+        self.parts: list[NearbyRays] = []
+        self.slack = 0.8
+        near = visible & is_static(model) & movable_kind(model)
+        others = visible & ~near
+        self.has_moving = bool(others.any())
+        # The others are cast without what MuJoCo counts as static, and no body is left out.
+        complete = not (others & is_welded(model)).any()
+        kept = excluded is None or not np.isin(model.geom_bodyid[near], excluded).any()
+        self.nearby: StaticGeoms | None = None
+        if complete and kept and near.sum() >= _MIN_GEOMS:
+            self.nearby = static_geoms(model, host, near)

@@ -1,0 +1,1 @@
+"""The robots that the velocity task comes with, one package each."""

@@ -1,0 +1,29 @@
+"""The `cpu` profile: settings with which a robot learns to walk on flat ground on a few cores.
+
+A few cores step some ten thousand environments a second, a hundredth of a GPU. So a batch is small,
+and the networks are small enough for their update not to take longer than the physics. How the
+numbers were found is in `docs/velocity.md`.
+"""
+
+from __future__ import annotations
+
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.rl.config import RslRlOnPolicyRunnerCfg
+
+
+def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
+    """Edit the configs of a velocity task in place."""
+    env_cfg.scene.num_envs = 512
+    rl_cfg.actor.hidden_dims = rl_cfg.critic.hidden_dims = (128, 64)
+    rl_cfg.actor.distribution_cfg = {
+        "class_name": "GaussianDistribution",
+        "init_std": 0.5,
+        "std_type": "scalar",
+    }
+    rl_cfg.algorithm.entropy_coef = 0.005
+    rl_cfg.max_iterations = 2000
+    rl_cfg.save_interval = 100
+    evaluation = rl_cfg.evaluation
+    evaluation.num_episodes = 200
+    evaluation.min_interval = 50
+    evaluation.solved_below = {"lin_vel_error": 0.25, "ang_vel_error": 0.35, "failure_rate": 0.05}

@@ -1,0 +1,43 @@
+"""Registers the velocity tasks of the Unitree G1. Names are imported when they are first used."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mjlab.tasks.registry import register_mjlab_task as register_mjlab_task
+from mjlab.utils.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from mjlab.tasks.velocity.config.g1.env_cfgs import (
+        unitree_g1_flat_env_cfg as unitree_g1_flat_env_cfg,
+    )
+    from mjlab.tasks.velocity.config.g1.env_cfgs import (
+        unitree_g1_rough_env_cfg as unitree_g1_rough_env_cfg,
+    )
+    from mjlab.tasks.velocity.config.g1.rl_cfg import (
+        unitree_g1_ppo_runner_cfg as unitree_g1_ppo_runner_cfg,
+    )
+    from mjlab.tasks.velocity.rl import VelocityOnPolicyRunner as VelocityOnPolicyRunner
+
+_ENV_CFGS = "mjlab.tasks.velocity.config.g1.env_cfgs"
+_RL_CFG = "mjlab.tasks.velocity.config.g1.rl_cfg"
+_RUNNER = "mjlab.tasks.velocity.rl"
+
+for _terrain in ("Flat", "Rough"):
+    register_mjlab_task(
+        task_id=f"Mjlab-Velocity-{_terrain}-Unitree-G1",
+        env_cfg=f"{_ENV_CFGS}:unitree_g1_{_terrain.lower()}_env_cfg",
+        rl_cfg=f"{_RL_CFG}:unitree_g1_ppo_runner_cfg",
+        runner_cls=f"{_RUNNER}:VelocityOnPolicyRunner",
+        profiles={"cpu": "mjlab.tasks.velocity.config.cpu_profile:cpu"},
+    )
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "VelocityOnPolicyRunner": _RUNNER,
+        "unitree_g1_flat_env_cfg": _ENV_CFGS,
+        "unitree_g1_ppo_runner_cfg": _RL_CFG,
+        "unitree_g1_rough_env_cfg": _ENV_CFGS,
+    },
+)

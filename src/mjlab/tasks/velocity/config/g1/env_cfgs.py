@@ -1,0 +1,142 @@
+"""The velocity tasks of the Unitree G1."""
+
+from __future__ import annotations
+
+from mjlab.asset_zoo.robots import get_g1_robot_cfg
+from mjlab.asset_zoo.robots.unitree_g1.g1_constants import G1_ACTION_SCALE
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.managers import RewardTermCfg
+from mjlab.sensor import ContactMatch, ContactSensorCfg, ObjRef, RingPatternCfg
+from mjlab.tasks.velocity import mdp
+from mjlab.tasks.velocity.variants import get_sensor, make_flat, make_playable
+from mjlab.tasks.velocity.velocity_env_cfg import make_velocity_env_cfg
+
+_TORSO = "torso_link"
+# In the order of the model, as contacts and sites are.
+_FEET = ("left_foot", "right_foot")
+_FOOT_GEOMS = tuple(f"{foot}{i}_collision" for foot in _FEET for i in range(1, 8))
+
+# Standard deviations of joint angles, in rad: legs bend to walk and swing to run, arms follow.
+_STD_WALKING = {
+    r".*hip_pitch.*": 0.3,
+    r".*hip_roll.*": 0.15,
+    r".*hip_yaw.*": 0.15,
+    r".*knee.*": 0.35,
+    r".*ankle_pitch.*": 0.25,
+    r".*ankle_roll.*": 0.1,
+    r".*waist_yaw.*": 0.2,
+    r".*waist_roll.*": 0.08,
+    r".*waist_pitch.*": 0.1,
+    r".*shoulder_pitch.*": 0.15,
+    r".*shoulder_roll.*": 0.15,
+    r".*shoulder_yaw.*": 0.1,
+    r".*elbow.*": 0.15,
+    r".*wrist.*": 0.3,
+}
+_STD_RUNNING = {
+    r".*hip_pitch.*": 0.5,
+    r".*hip_roll.*": 0.2,
+    r".*hip_yaw.*": 0.2,
+    r".*knee.*": 0.6,
+    r".*ankle_pitch.*": 0.35,
+    r".*ankle_roll.*": 0.15,
+    r".*waist_yaw.*": 0.3,
+    r".*waist_roll.*": 0.08,
+    r".*waist_pitch.*": 0.2,
+    r".*shoulder_pitch.*": 0.5,
+    r".*shoulder_roll.*": 0.2,
+    r".*shoulder_yaw.*": 0.15,
+    r".*elbow.*": 0.35,
+    r".*wrist.*": 0.3,
+}
+
+
+def unitree_g1_rough_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
+    """Return the task on rough terrain, to train or to `play` with."""
+    cfg = make_velocity_env_cfg()
+    cfg.sim.mujoco.ccd_iterations = 500
+    cfg.sim.contact_sensor_maxmatch = 500
+    cfg.sim.nconmax = 70
+    cfg.scene.entities = {"robot": get_g1_robot_cfg()}
+    terrain = cfg.scene.terrain
+    assert terrain is not None
+    assert terrain.terrain_generator is not None
+    terrain.terrain_generator.curriculum = True
+    _set_sensors(cfg)
+    _set_terms(cfg)
+    _set_rewards(cfg)
+    cfg.viewer.body_name = _TORSO
+    if play:
+        make_playable(cfg)
+    return cfg
+
+
+def unitree_g1_flat_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
+    """Return the task on flat ground, to train or to `play` with."""
+    cfg = unitree_g1_rough_env_cfg(play=play)
+    make_flat(cfg, play)
+    return cfg
+
+
+def _set_sensors(cfg: ManagerBasedRlEnvCfg) -> None:
+    terrain_scan = get_sensor(cfg, "terrain_scan")
+    terrain_scan.frame = ObjRef(type="body", name="pelvis", entity="robot")
+    foot_heights = get_sensor(cfg, "foot_height_scan")
+    foot_heights.frame = tuple(ObjRef(type="site", name=foot, entity="robot") for foot in _FEET)
+    foot_heights.pattern = RingPatternCfg.single_ring(radius=0.03, num_samples=6)
+    feet_ground_contact = ContactSensorCfg(
+        name="feet_ground_contact",
+        primary=ContactMatch(
+            mode="subtree",
+            pattern=r"^(left_ankle_roll_link|right_ankle_roll_link)$",
+            entity="robot",
+        ),
+        secondary=ContactMatch(mode="body", pattern="terrain"),
+        fields=("found", "force"),
+        reduce="netforce",
+        num_slots=1,
+        track_air_time=True,
+    )
+    itself = ContactMatch(mode="subtree", pattern="pelvis", entity="robot")
+    self_collision = ContactSensorCfg(
+        name="self_collision",
+        primary=itself,
+        secondary=itself,
+        fields=("found", "force"),
+        reduce="maxforce",
+        num_slots=1,
+        history_length=4,
+    )
+    cfg.scene.sensors += (feet_ground_contact, self_collision)
+
+
+def _set_terms(cfg: ManagerBasedRlEnvCfg) -> None:
+    joint_pos, twist = cfg.actions["joint_pos"], cfg.commands["twist"]
+    assert isinstance(joint_pos, mdp.JointPositionActionCfg)
+    joint_pos.scale = dict(G1_ACTION_SCALE)
+    assert isinstance(twist, mdp.UniformVelocityCommandCfg)
+    # Above the head.
+    twist.viz.z_offset = 1.15
+    friction, base_com = cfg.events["foot_friction"], cfg.events["base_com"]
+    assert friction is not None
+    friction.params["asset_cfg"].geom_names = _FOOT_GEOMS
+    assert base_com is not None
+    base_com.params["asset_cfg"].body_names = (_TORSO,)
+
+
+def _set_rewards(cfg: ManagerBasedRlEnvCfg) -> None:
+    terms = {name: term for name, term in cfg.rewards.items() if term is not None}
+    for name in ("upright", "body_ang_vel"):
+        terms[name].params["asset_cfg"].body_names = (_TORSO,)
+    for name in ("foot_clearance", "foot_slip"):
+        terms[name].params["asset_cfg"].site_names = _FEET
+    terms["pose"].params["std_standing"] = {".*": 0.05}
+    terms["pose"].params["std_walking"] = dict(_STD_WALKING)
+    terms["pose"].params["std_running"] = dict(_STD_RUNNING)
+    terms["body_ang_vel"].weight = -0.05
+    terms["angular_momentum"].weight = -0.02
+    cfg.rewards["self_collisions"] = RewardTermCfg(
+        func=mdp.self_collision_cost,
+        weight=-1.0,
+        params={"sensor_name": "self_collision", "force_threshold": 10.0},
+    )

@@ -1,0 +1,166 @@
+"""The velocity tasks of the Unitree Go1."""
+
+from __future__ import annotations
+
+from mjlab.asset_zoo.robots import get_go1_robot_cfg
+from mjlab.asset_zoo.robots.unitree_go1.go1_constants import GO1_ACTION_SCALE
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.managers import EventTermCfg, RewardTermCfg, SceneEntityCfg, TerminationTermCfg
+from mjlab.sensor import ContactMatch, ContactSensorCfg, ObjRef, RingPatternCfg
+from mjlab.tasks.velocity import mdp
+from mjlab.tasks.velocity.variants import (
+    get_sensor,
+    make_flat,
+    make_playable,
+    remove_sensors,
+)
+from mjlab.tasks.velocity.velocity_env_cfg import make_velocity_env_cfg
+
+_TRUNK = "trunk"
+# In the order of the model, as contacts and sites are.
+_FEET = ("FR", "FL", "RR", "RL")
+_FOOT_GEOMS = tuple(f"{foot}_foot_collision" for foot in _FEET)
+
+
+def unitree_go1_rough_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
+    """Return the task on rough terrain, to train or to `play` with."""
+    cfg = make_velocity_env_cfg()
+    _set_physics(cfg)
+    cfg.scene.entities = {"robot": get_go1_robot_cfg()}
+    terrain = cfg.scene.terrain
+    assert terrain is not None
+    assert terrain.terrain_generator is not None
+    terrain.terrain_generator.curriculum = True
+    _set_sensors(cfg)
+    _set_actions_and_events(cfg)
+    _set_rewards(cfg)
+    cfg.terminations.pop("fell_over")
+    cfg.terminations["illegal_contact"] = TerminationTermCfg(
+        func=mdp.illegal_contact, params={"sensor_name": "thigh_ground_touch"}
+    )
+    cfg.viewer.body_name = _TRUNK
+    cfg.viewer.distance = 1.5
+    cfg.viewer.elevation = -10.0
+    if play:
+        make_playable(cfg)
+    return cfg
+
+
+def unitree_go1_flat_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
+    """Return the task on flat ground, to train or to `play` with."""
+    cfg = unitree_go1_rough_env_cfg(play=play)
+    make_flat(cfg, play)
+    # On a plane it is enough to see that the robot has fallen.
+    remove_sensors(
+        cfg, "self_collision", "thigh_ground_touch", "shank_ground_touch", "trunk_ground_touch"
+    )
+    for name in ("self_collisions", "shank_collision", "trunk_head_collision"):
+        cfg.rewards.pop(name)
+    cfg.terminations.pop("illegal_contact")
+    fell_over = make_velocity_env_cfg().terminations["fell_over"]
+    cfg.terminations["fell_over"] = fell_over
+    return cfg
+
+
+def _set_physics(cfg: ManagerBasedRlEnvCfg) -> None:
+    cfg.sim.mujoco.ccd_iterations = 500
+    cfg.sim.mujoco.impratio = 10
+    cfg.sim.mujoco.cone = "elliptic"
+    cfg.sim.contact_sensor_maxmatch = 500
+
+
+def _set_sensors(cfg: ManagerBasedRlEnvCfg) -> None:
+    terrain_scan = get_sensor(cfg, "terrain_scan")
+    terrain_scan.frame = ObjRef(type="body", name=_TRUNK, entity="robot")
+    foot_heights = get_sensor(cfg, "foot_height_scan")
+    foot_heights.frame = tuple(ObjRef(type="site", name=foot, entity="robot") for foot in _FEET)
+    foot_heights.pattern = RingPatternCfg.single_ring(radius=0.04, num_samples=4)
+    feet_ground_contact = ContactSensorCfg(
+        name="feet_ground_contact",
+        primary=ContactMatch(mode="geom", pattern=_FOOT_GEOMS, entity="robot"),
+        secondary=ContactMatch(mode="body", pattern="terrain"),
+        fields=("found", "force"),
+        reduce="netforce",
+        num_slots=1,
+        track_air_time=True,
+    )
+    itself = ContactMatch(mode="subtree", pattern=_TRUNK, entity="robot")
+    self_collision = ContactSensorCfg(
+        name="self_collision", primary=itself, secondary=itself, history_length=4
+    )
+    cfg.scene.sensors += (
+        feet_ground_contact,
+        self_collision,
+        _touch("thigh_ground_touch", [f"{f}_thigh_collision{i}" for f in _FEET for i in (1, 2, 3)]),
+        _touch("shank_ground_touch", [f"{f}_calf_collision{i}" for f in _FEET for i in (1, 2)]),
+        _touch("trunk_ground_touch", ["trunk_collision", "head_collision"]),
+    )
+
+
+def _touch(name: str, geoms: list[str]) -> ContactSensorCfg:
+    """Return a sensor of the strongest contact of each geom with the ground, in every substep."""
+    return ContactSensorCfg(
+        name=name,
+        primary=ContactMatch(mode="geom", pattern=tuple(geoms), entity="robot"),
+        secondary=ContactMatch(mode="body", pattern="terrain"),
+        fields=("found", "force"),
+        reduce="maxforce",
+        num_slots=1,
+        history_length=4,
+    )
+
+
+def _set_actions_and_events(cfg: ManagerBasedRlEnvCfg) -> None:
+    joint_pos = cfg.actions["joint_pos"]
+    assert isinstance(joint_pos, mdp.JointPositionActionCfg)
+    joint_pos.scale = dict(GO1_ACTION_SCALE)
+    base_com = cfg.events["base_com"]
+    assert base_com is not None
+    base_com.params["asset_cfg"].body_names = (_TRUNK,)
+    # Feet of condim 6 also resist spinning and rolling, which spread over orders of magnitude.
+    cfg.events.pop("foot_friction")
+    cfg.events["foot_friction_slide"] = _foot_friction(0, (0.3, 1.5))
+    cfg.events["foot_friction_spin"] = _foot_friction(1, (1e-4, 2e-2), "log_uniform")
+    cfg.events["foot_friction_roll"] = _foot_friction(2, (1e-5, 5e-3), "log_uniform")
+
+
+def _foot_friction(
+    axis: int, ranges: tuple[float, float], distribution: str | None = None
+) -> EventTermCfg:
+    return EventTermCfg(
+        func=mdp.dr.geom_friction,
+        mode="startup",
+        params={
+            "asset_cfg": SceneEntityCfg("robot", geom_names=_FOOT_GEOMS),
+            "operation": "abs",
+            **({} if distribution is None else {"distribution": distribution}),
+            "axes": [axis],
+            "ranges": ranges,
+            "shared_random": True,
+        },
+    )
+
+
+def _set_rewards(cfg: ManagerBasedRlEnvCfg) -> None:
+    params = {name: term.params for name, term in cfg.rewards.items() if term is not None}
+    params["upright"]["asset_cfg"].body_names = (_TRUNK,)
+    # On slopes the trunk follows the ground.
+    params["upright"]["terrain_sensor_names"] = ("terrain_scan",)
+    params["body_ang_vel"]["asset_cfg"].body_names = (_TRUNK,)
+    for name in ("foot_clearance", "foot_slip"):
+        params[name]["asset_cfg"].site_names = _FEET
+    hips_and_thighs, calves = (
+        r".*(FR|FL|RR|RL)_(hip|thigh)_joint.*",
+        r".*(FR|FL|RR|RL)_calf_joint.*",
+    )
+    params["pose"]["std_standing"] = {hips_and_thighs: 0.05, calves: 0.1}
+    params["pose"]["std_walking"] = {hips_and_thighs: 0.3, calves: 0.6}
+    params["pose"]["std_running"] = {hips_and_thighs: 0.3, calves: 0.6}
+    for name, sensor_name in (
+        ("self_collisions", "self_collision"),
+        ("shank_collision", "shank_ground_touch"),
+        ("trunk_head_collision", "trunk_ground_touch"),
+    ):
+        cfg.rewards[name] = RewardTermCfg(
+            func=mdp.self_collision_cost, weight=-0.1, params={"sensor_name": sensor_name}
+        )

@@ -1,0 +1,77 @@
+"""Termination terms of the velocity task. Each returns bool (N,)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from mjlab.managers.build_checks import checked_when_built
+from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.tasks.velocity.mdp.sensor_checks import check_contact_sensor
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+    from mjlab.envs import ManagerBasedRlEnv
+
+_DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
+# Positions are those of before the reset until the second step of an episode.
+_MIN_STEPS = 2
+
+
+@checked_when_built(check_contact_sensor)
+def illegal_contact(
+    env: ManagerBasedRlEnv, sensor_name: str, force_threshold: float = 10.0
+) -> torch.Tensor:
+    """Something touches what it should not.
+
+    With a history of forces: any force above `force_threshold` (N) in any of those last substeps.
+    Without one: any contact.
+    """
+    data = env.scene[sensor_name].data
+    if data.force_history is None:
+        return (data.found > 0).any(dim=1)
+    hits = data.force_history.square().sum(dim=-1) > force_threshold**2
+    return hits.flatten(start_dim=1).any(dim=1)
+
+
+def out_of_terrain_bounds(
+    env: ManagerBasedRlEnv, margin: float = 0.3, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
+) -> torch.Tensor:
+    """The root has left a generated terrain, or is closer than `margin` (m) to its edge.
+
+    Never on a plane, which has no edge. The terrain is as large as the grid that was really built,
+    with its border.
+    """
+    asset: Entity = env.scene[asset_cfg.name]
+    position = asset.data.root_link_pos_w
+    terrain = env.scene.terrain
+    if terrain is None or terrain.terrain_origins is None or terrain.cfg.terrain_generator is None:
+        return torch.zeros_like(position[:, 0], dtype=torch.bool)
+    rows, cols = terrain.terrain_origins.shape[:2]
+    generator = terrain.cfg.terrain_generator
+    border = max(generator.border_width, 0.0) - margin
+    limit_x = max(rows * generator.size[0] / 2.0 + border, 0.0)
+    limit_y = max(cols * generator.size[1] / 2.0 + border, 0.0)
+    return (position[:, 0].abs() > limit_x) | (position[:, 1].abs() > limit_y)
+
+
+def terrain_edge_reached(
+    env: ManagerBasedRlEnv,
+    threshold_fraction: float = 0.95,
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+) -> torch.Tensor:
+    """The root is at the edge of the terrain cell in which the environment started.
+
+    It is further from the environment's origin, in x or y, than `threshold_fraction` of half the
+    cell. Never on a plane, nor in the first two steps of an episode.
+    """
+    asset: Entity = env.scene[asset_cfg.name]
+    offset = (asset.data.root_link_pos_w - env.scene.env_origins)[:, :2].abs()
+    terrain = env.scene.terrain
+    if terrain is None or terrain.terrain_origins is None or terrain.cfg.terrain_generator is None:
+        return torch.zeros_like(offset[:, 0], dtype=torch.bool)
+    size_x, size_y = terrain.cfg.terrain_generator.size
+    reached_x = offset[:, 0] > size_x / 2.0 * threshold_fraction
+    reached_y = offset[:, 1] > size_y / 2.0 * threshold_fraction
+    return (reached_x | reached_y) & (env.episode_length_buf > _MIN_STEPS)

@@ -1,0 +1,79 @@
+"""Sliders in the browser viewer that command the robot in view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+if TYPE_CHECKING:
+    import viser
+
+_STEP = 0.05
+_MAX_BOUNDS = (0.1, 10.0)
+_COMPONENTS = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
+
+
+class VelocityJoystick:
+    """A panel with a slider for each component of the command, and one for each slider's range."""
+
+    def __init__(
+        self,
+        name: str,
+        server: viser.ViserServer,
+        ranges: Any,
+        get_env_idx: Callable[[], int],
+        on_change: Callable[[], None] | None = None,
+    ) -> None:
+        """Add the panel to the current place in the page.
+
+        Args:
+            name: Title of the panel.
+            server: The page's server.
+            ranges: `UniformVelocityCommandCfg.Ranges`; sliders go up to their upper bounds.
+            get_env_idx: Returns the environment in view.
+            on_change: Called after every change.
+        """
+        self._get_env_idx = get_env_idx
+        self._on_change = on_change
+        self._sliders: list[Any] = []
+        with server.gui.add_folder(name.capitalize()):
+            self._enabled = server.gui.add_checkbox(
+                "Enable", False, hint="Command the environment in view by these sliders."
+            )
+            for component in _COMPONENTS:
+                self._sliders.append(self._add_slider(server, component, ranges))
+            zero = server.gui.add_button("Zero")
+        self._enabled.on_update(self._changed)
+        zero.on_click(self._zero)
+
+    def _add_slider(self, server: viser.ViserServer, component: str, ranges: Any) -> Any:
+        low, high = _MAX_BOUNDS
+        # A range may be negative or empty, and a slider may not.
+        limit = min(max(abs(bound) for bound in (*getattr(ranges, component), low)), high)
+        slider = server.gui.add_slider(component, -limit, limit, _STEP, 0.0)
+        maximum = server.gui.add_slider(f"Max {component}", low, high, 0.1, limit)
+        slider.on_update(self._changed)
+
+        @maximum.on_update
+        def _(_event: Any) -> None:
+            slider.value = min(max(slider.value, -maximum.value), maximum.value)
+            slider.min, slider.max = -maximum.value, maximum.value
+
+        return slider
+
+    def write_to(self, command: torch.Tensor) -> None:
+        """Overwrite the row of the environment in view of (N, 3) commands, if enabled."""
+        index = self._get_env_idx()
+        if self._enabled.value and 0 <= index < len(command):
+            values = [float(slider.value) for slider in self._sliders]
+            command[index] = torch.tensor(values, dtype=command.dtype, device=command.device)
+
+    def _zero(self, _event: Any) -> None:
+        for slider in self._sliders:
+            slider.value = 0.0
+
+    def _changed(self, _event: Any) -> None:
+        if self._on_change is not None:
+            self._on_change()

@@ -1,0 +1,225 @@
+"""Training in several processes: one policy, one run folder, one fate."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from commands import TASK
+from process_runs import SMALL, Ended, ProcessRun
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from mjlab.rl.checkpoint import load_checkpoint
+from mjlab.scripts.run_folder import checkpoints_in, read_run_info
+from mjlab.scripts.train_run import _build_env, parse_train_flags
+from mjlab.utils.processes import ProcessRank
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory) -> tuple[ProcessRun, list[Ended]]:
+    """Return a finished run of two processes and two iterations, and how they ended."""
+    folder = tmp_path_factory.mktemp("pair")
+    run = ProcessRun(folder, "--agent.max-iterations", "2")
+    ended = run.end()
+    assert [process.status for process in ended] == [0, 0], ended
+    return run, ended
+
+
+def assert_same_weights(run: ProcessRun) -> None:
+    first, second = run.probe(0)["weights"], run.probe(1)["weights"]
+    assert first.keys() == second.keys()
+    assert [name for name in first if not torch.equal(first[name], second[name])] == []
+    assert run.probe(0)["learning_rate"] == run.probe(1)["learning_rate"]
+
+
+def test_both_end_with_the_same_networks_bit_for_bit(pair):
+    run, _ = pair
+    assert_same_weights(run)
+    (run_dir,) = run.runs()
+    saved = load_checkpoint(run_dir / "model_1.pt")["actor_state_dict"]
+    held = run.probe(1)["weights"]
+    assert [name for name in saved if not torch.equal(saved[name], held[name])] == []
+
+
+def test_observation_normalizers_have_seen_the_data_of_both(pair):
+    run, _ = pair
+    # Two iterations of four steps in four environments, in each of two processes.
+    assert run.probe(0)["weights"]["obs_normalizer.count"] == 2 * 4 * 4 * 2
+
+
+def test_every_process_draws_random_numbers_of_its_own(pair):
+    run, _ = pair
+    first, second = run.probe(0), run.probe(1)
+    assert (first["seed"], second["seed"]) == (7, 8)
+    assert (first["env_seed"], second["env_seed"]) == (7, 8)
+    assert not torch.equal(first["qpos"], second["qpos"])
+    assert not torch.equal(first["draw"], second["draw"])
+
+
+def test_the_first_alone_writes_files_and_prints(pair):
+    run, (first, second) = pair
+    (run_dir,) = run.runs()
+    assert len(list(run_dir.glob("events.out.tfevents.*"))) == 1
+    assert (run_dir / "params" / "agent.yaml").is_file()
+    assert run.probe(0)["saved"] == ["model_0.pt", "model_1.pt"]
+    assert run.probe(1)["saved"] == []
+    assert f"{TASK}, 4 environments in each of 2 processes" in first.out
+    assert "Training finished" in first.out
+    assert (second.out, second.err) == ("", "")
+    assert f"Run:     {run_dir}" in (run_dir / "torchrunx" / "rank_1.log").read_text()
+
+
+@pytest.mark.parametrize(("rank", "render_mode"), [(0, "rgb_array"), (1, None)])
+def test_the_first_alone_renders(tmp_path, rank, render_mode):
+    cfg = parse_train_flags(TASK, ["--num-envs", "2", "--video"], "train")
+    env = _build_env(cfg, "cpu", tmp_path, ProcessRank(rank, 2, rank, 2))
+    assert env.render_mode == render_mode
+    env.close()
+
+
+def test_steps_are_counted_over_both(pair):
+    run, _ = pair
+    assert run.probe(0)["total_steps"] == 2 * 4 * 4 * 2
+
+
+def test_the_cores_are_shared_out(pair):
+    run, _ = pair
+    cores = len(os.sched_getaffinity(0))
+    assert run.probe(0)["threads"] == run.probe(1)["threads"] == max(1, cores // 2)
+
+
+def test_both_resume_from_the_checkpoint_that_the_first_finds_before_there_is_a_new_folder(pair):
+    run, _ = pair
+    (before,) = run.runs()
+    # A folder without a checkpoint, as a run leaves that was killed early.
+    early = before.with_name("9999-01-01_00-00-00")
+    early.mkdir()
+    flags = ("--agent.resume", "True", "--agent.max-iterations", "3", "--torchrunx-log-dir", "")
+    resumed = ProcessRun(run.folder, *flags, patches=("count_lookups",))
+    ended = resumed.end()
+    early.rmdir()
+    assert [process.status for process in ended] == [0, 0], ended
+    # Also a process that is late does not look again, and would find the new folder.
+    lookups = (run.folder / "lookups").read_text().splitlines()
+    assert lookups == [f"0 {before / 'model_1.pt'} 2"]
+    assert "several processes share the run" in ended[0].err
+    (run_dir,) = set(resumed.runs()) - {before}
+    assert [path.name for path in checkpoints_in(run_dir)] == ["model_2.pt"]
+    assert not (run_dir / "torchrunx").exists()
+    assert resumed.probe(1)["iterations"] == 3
+    assert resumed.probe(0)["total_steps"] == 3 * 4 * 4 * 2
+    assert_same_weights(resumed)
+    events = EventAccumulator(str(run_dir)).Reload()
+    assert [event.step for event in events.Scalars("Train/mean_step_reward")] == [2]
+
+
+def test_a_process_that_fails_while_training_takes_the_other_along_and_says_why(tmp_path):
+    flags = ("--agent.max-iterations", "1000")
+    run = ProcessRun(tmp_path, *flags, patches=("fail_while_training",))
+    first, second = run.end()
+    assert (first.status, second.status) == (3, 1)
+    assert "error in process 1: the robot of process 1 fell off the table" in second.err
+    assert first.err.count("error: ") == 1
+    assert "Another process of this run ended" in first.err
+    assert "Traceback" not in first.err
+    (run_dir,) = run.runs()
+    assert read_run_info(run_dir)["ended"] == "failed"
+    assert checkpoints_in(run_dir)[-1].name == "model_0.pt"
+
+
+def test_a_process_that_fails_before_training_is_named_and_leaves_no_folder(tmp_path):
+    first, second = ProcessRun(tmp_path, patches=("fail_while_building",)).end()
+    assert (first.status, second.status) == (3, 1)
+    assert "error in process 1: no room in process 1" in second.err
+    assert "Process 1 of this run failed: ValueError: no room in process 1" in first.err
+    assert list((tmp_path / "logs" / "cartpole").iterdir()) == []
+
+
+@pytest.mark.slow
+def test_what_is_wrong_in_all_processes_is_told_once(tmp_path):
+    first, second = ProcessRun(tmp_path, "--agent.max-iterations", "0").end()
+    assert (first.status, second.status) == (1, 3)
+    assert "--agent.max-iterations is 0" in first.err
+    assert second.err == ""
+
+
+@pytest.mark.slow
+def test_a_signal_to_one_stops_all_after_the_same_iteration_and_saves_once(tmp_path):
+    run = ProcessRun(tmp_path, "--agent.max-iterations", "1000000")
+    end = time.monotonic() + 60
+    while not list(tmp_path.glob("logs/cartpole/*/model_0.pt")) and time.monotonic() < end:
+        time.sleep(0.01)
+    run.send(1, signal.SIGINT)
+    ended = run.end()
+    assert [process.status for process in ended] == [0, 0], ended
+    assert "Training interrupted" in ended[0].out
+    (run_dir,) = run.runs()
+    iterations = read_run_info(run_dir)["iterations"]
+    assert run.probe(0)["iterations"] == run.probe(1)["iterations"] == iterations
+    assert checkpoints_in(run_dir)[-1].name == f"model_{iterations - 1}.pt"
+    assert len(run.probe(0)["saved"]) == len(set(run.probe(0)["saved"]))
+    assert_same_weights(run)
+
+
+@pytest.mark.slow
+def test_torchrun_trains_and_reports_a_failure(tmp_path):
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2"]
+    torchrun += ["--master-port", "0", "--rdzv-backend", "c10d", "--rdzv-endpoint", "localhost:0"]
+    command = [*torchrun, "-m", "mjlab.scripts.train", TASK, *SMALL, "--log-root", str(tmp_path)]
+    done = subprocess.run(
+        [*command, "--agent.max-iterations", "2"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Training finished" in done.stdout
+    (run_dir,) = (tmp_path / "cartpole").iterdir()
+    assert len(list(run_dir.glob("events.out.tfevents.*"))) == 1
+    assert [path.name for path in checkpoints_in(run_dir)] == ["model_0.pt", "model_1.pt"]
+    resumed = subprocess.run(
+        [*command, "--agent.max-iterations", "3", "--agent.resume", "True"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert resumed.returncode == 0, resumed.stderr
+    assert f"Resumed: {run_dir / 'model_1.pt'}, iteration 2" in resumed.stdout
+    failed = subprocess.run(
+        [*command, "--agent.max-iterations", "0"], capture_output=True, text=True, check=False
+    )
+    assert failed.returncode != 0
+    assert "--agent.max-iterations is 0" in failed.stderr
+
+
+@pytest.mark.slow
+def test_the_launcher_trains_and_ctrl_c_saves_once(tmp_path):
+    program = (
+        "from mjlab.scripts.cli import run_command\n"
+        "from mjlab.scripts.launcher import launch_workers, train_command\n"
+        "run_command(lambda argv: launch_workers(train_command(argv[0], argv[1:]), 2))\n"
+    )
+    flags = [TASK, *SMALL, "--log-root", str(tmp_path), "--agent.max-iterations", "1000000"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, *flags],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        process_group=0,
+    )
+    end = time.monotonic() + 120
+    while not list(Path(tmp_path).glob("cartpole/*/model_0.pt")) and time.monotonic() < end:
+        assert process.poll() is None, process.communicate()[0]
+        time.sleep(0.02)
+    # As a terminal does it: to the whole process group.
+    os.killpg(process.pid, signal.SIGINT)
+    out = process.communicate(timeout=120)[0]
+    assert process.returncode == 0, out
+    assert out.count("SIGINT: finishing this iteration, then saving") == 1
+    (run_dir,) = (tmp_path / "cartpole").iterdir()
+    info = read_run_info(run_dir)
+    assert info["ended"] == "interrupted"
+    assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"

@@ -1,0 +1,125 @@
+"""The page that shows terrains, without a browser."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from mjlab.scripts.cli import UserError
+from mjlab.scripts.terrain_knobs import knobs_of, with_values
+from mjlab.scripts.terrain_page import TerrainPage
+from mjlab.scripts.terrain_scene import build_terrain_scene
+from mjlab.scripts.visualize_terrain import VisualizeTerrainConfig, run_visualize_terrain
+from mjlab.terrains.config import ALL_TERRAIN_PRESETS, flat, hf_pyramid_slope, wave_terrain
+
+
+@pytest.fixture
+def server() -> Iterator:
+    import viser
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
+    yield server
+    server.stop()
+
+
+@pytest.mark.parametrize("name", ALL_TERRAIN_PRESETS)
+def test_every_preset_has_knobs_for_all_but_its_place_in_the_grid(name):
+    cfg = ALL_TERRAIN_PRESETS[name]()
+    knobs = {knob.field: knob for knob in knobs_of(cfg)}
+    assert set(knobs) == set(vars(cfg)) - {
+        "proportion", "size", "flat_patch_sampling", "downsampled_scale",
+    }  # fmt: skip
+    for knob in knobs.values():
+        if knob.kind in ("number", "count"):
+            assert knob.low <= knob.value <= knob.high
+        if knob.kind == "range":
+            assert knob.low <= knob.value[0] <= knob.value[1] <= knob.high
+    assert with_values(cfg, {knob.field: knob.value for knob in knobs.values()}) == cfg
+
+
+def test_values_of_sliders_become_fields_of_a_copy():
+    cfg = wave_terrain()
+    changed = with_values(cfg, {"num_waves": 2, "amplitude_range": [0.1, 0.3]})
+    assert (changed.num_waves, changed.amplitude_range) == (2, (0.1, 0.3))
+    assert cfg == wave_terrain()
+
+
+def test_a_robot_stands_at_each_origin():
+    kinds = {"flat": flat(), "slope": hf_pyramid_slope()}
+    scene = build_terrain_scene(kinds, 8.0, 3, 0, "unitree_go1")
+    assert scene.origins.shape == (3, 2, 3)
+    positions, rotations = scene.poses()
+    trunk = scene.model.body("robot/trunk").id
+    above = positions[:, trunk] - scene.origins.reshape(-1, 3)
+    np.testing.assert_allclose(above, np.tile(above[0], (6, 1)), atol=1e-6)
+    assert 0.2 < above[0, 2] < 0.5
+    terrain = scene.model.body("terrain").id
+    np.testing.assert_array_equal(positions[:, terrain], 0.0)
+    assert rotations.shape == (6, scene.model.nbody, 3, 3)
+
+
+def test_polygons_are_counted():
+    scene = build_terrain_scene({"slope": hf_pyramid_slope()}, 8.0, 2, 0, "none")
+    # Two fields, and the four boxes of the frame around them.
+    assert scene.num_polygons == 2 * 2 * 79 * 79 + 4 * 12
+
+
+def test_the_page_shows_what_its_controls_say(server):
+    page = TerrainPage(server, "wave_terrain", num_levels=2, robot="none")
+    page.rebuild()
+    assert page.status.startswith("1 x 2 terrains")
+    low = page.scene.model.hfield_size[1, 2]
+    page._handles["amplitude_range"].value = (0.0, 0.4)
+    page.rebuild()
+    assert page.scene.model.hfield_size[1, 2] == pytest.approx(2 * low, rel=0.02)
+    page._terrain.value = "flat"
+    page.rebuild()
+    assert page.scene.model.nhfield == 0
+    assert page._handles == {}
+
+
+def test_all_presets_are_shown_side_by_side(server):
+    page = TerrainPage(server, "all", num_levels=1, robot="none")
+    page.rebuild()
+    assert page.scene.origins.shape == (1, len(ALL_TERRAIN_PRESETS), 3)
+
+
+def test_a_terrain_that_cannot_be_built_is_told_on_the_page_and_the_last_one_stays(server):
+    page = TerrainPage(server, "wave_terrain", num_levels=1, size=4.0, robot="none")
+    page.rebuild()
+    last = page.scene
+    page._handles["border_width"].value = 0.05
+    page.rebuild()
+    assert "cannot be built" in page.status
+    assert "border_width is 0.05" in page.status
+    assert page.scene is last
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"terrain": "stair"}, "no terrain preset 'stair'. Choose from: all, flat, pyramid_stairs"),
+        ({"num_levels": 0}, "num_levels is 0"),
+        ({"size": 100.0}, "size 100.0"),
+    ],
+)
+def test_flags_that_make_no_sense_are_refused(fields, message):
+    with pytest.raises(UserError, match=message):
+        run_visualize_terrain(VisualizeTerrainConfig(**fields))
+
+
+def test_the_module_is_a_command():
+    told = subprocess.run(
+        [sys.executable, "-m", "mjlab.scripts.visualize_terrain", "--help"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert told.returncode == 0
+    assert "A preset of `mjlab.terrains.config`, or `all`" in told.stdout
