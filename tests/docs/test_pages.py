@@ -20,6 +20,7 @@ _MAKE = re.compile(r"\bmake ([a-z-]+)")
 
 # Flags of `train` that stand for any field of the configs, and those of other programs.
 _ELSEWHERE = {"help", "seeds", "keyword", "output", "tag", "title", "group"}
+_TORCHRUN = {"nnodes", "node-rank", "nproc-per-node", "rdzv-backend", "rdzv-endpoint", "rdzv-id"}
 
 
 def _ids(page: Path) -> str:
@@ -48,6 +49,7 @@ def test_flags_are_fields_of_the_commands() -> None:
 
     from mjlab.scripts.evaluate import EvaluateConfig
     from mjlab.scripts.play import PlayConfig
+    from mjlab.scripts.profile_env import ProfileConfig
     from mjlab.scripts.train import TrainConfig
 
     def exists(config: object, path: list[str]) -> bool:
@@ -60,11 +62,14 @@ def test_flags_are_fields_of_the_commands() -> None:
             return False
         return exists(getattr(config, name), path[1:])
 
-    configs = (TrainConfig.from_task("Mjlab-Cartpole-Swingup"), PlayConfig(), EvaluateConfig())
+    train = TrainConfig.from_task("Mjlab-Cartpole-Swingup")
+    configs = (train, PlayConfig(), EvaluateConfig(), ProfileConfig())
     unknown = set()
     for page in PAGES:
         for flag in _FLAG.findall(_code(page.read_text(encoding="utf-8"))):
-            known = flag in _ELSEWHERE or any(exists(cfg, flag.split(".")) for cfg in configs)
+            known = flag in _ELSEWHERE | _TORCHRUN or any(
+                exists(cfg, flag.split(".")) for cfg in configs
+            )
             if not known:
                 unknown.add(f"{page.name}: --{flag}")
     assert not unknown

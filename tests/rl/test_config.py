@@ -80,6 +80,17 @@ def test_small_networks_get_one_thread_and_large_ones_more(monkeypatch):
         torch_threads(1, 1)
 
 
+def test_processes_of_one_machine_share_its_cores(monkeypatch):
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: set(range(6)), raising=False)
+    monkeypatch.setenv("WORLD_SIZE", "3")
+    assert torch_threads(400_000, 24_576) == 2
+    # This is what torchrun sets, unasked.
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert torch_threads(400_000, 24_576) == 1
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
+    assert torch_threads(400_000, 24_576) == 2
+
+
 def test_the_number_of_threads_is_put_back():
     before = torch.get_num_threads()
     with using_torch_threads(before + 1):

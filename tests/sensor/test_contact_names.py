@@ -55,6 +55,8 @@ def test_without_an_entity_names_are_literal_and_in_the_order_given():
     assert scene["touch"].primary_names == ["robot/right_foot", "robot/left_foot"]
     with pytest.raises(ValueError, match="taken literally"):
         robot(geom("robot/.*_foot", None))
+    with pytest.raises(ValueError, match="twice"):
+        robot(geom(("robot/left_foot", "robot/left_foot"), None))
 
 
 def test_the_terrain_is_an_entity_too():

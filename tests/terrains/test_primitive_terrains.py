@@ -291,6 +291,14 @@ def test_beams_lead_from_the_platform_to_the_frame(size, difficulty):
             assert built.height(x, y) == pytest.approx(0.2), (k, distance)
 
 
+def test_there_is_no_beam_where_the_platform_reaches_the_frame():
+    built = preset(
+        "narrow_beams", difficulty=0.0, size=(3.3, 7.0), border_width=1.0, platform_width=1.65
+    )
+    assert 6 < built.model.ngeom < 18
+    assert (built.model.geom_size >= 0.005).all()
+
+
 def test_a_ring_that_fills_the_middle_has_no_empty_sides():
     built = ground(
         BoxNestedRingsTerrainCfg(

@@ -75,16 +75,20 @@ def attach_metadata_to_onnx(onnx_path: str, metadata: Mapping[str, list | str | 
 
     model = onnx.load(onnx_path)
     kept = {entry.key: entry.value for entry in model.metadata_props}
-    new = {
+    del model.metadata_props[:]
+    for key, value in {**kept, **metadata_texts(metadata)}.items():
+        model.metadata_props.add(key=key, value=value)
+    write_atomically(Path(onnx_path), model.SerializeToString())
+
+
+def metadata_texts(metadata: Mapping[str, list | str | float]) -> dict[str, str]:
+    """Return `metadata` as the strings that the ONNX file keeps."""
+    return {
         key: list_to_csv_str(value, decimals=None)
         if isinstance(value, (list, tuple))
         else _item_to_str(value, None)
         for key, value in metadata.items()
     }
-    del model.metadata_props[:]
-    for key, value in {**kept, **new}.items():
-        model.metadata_props.add(key=key, value=value)
-    write_atomically(Path(onnx_path), model.SerializeToString())
 
 
 def write_atomically(path: Path, content: bytes) -> None:

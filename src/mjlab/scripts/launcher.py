@@ -43,10 +43,12 @@ def launch_workers(
     """
     import torch
 
+    from mjlab.rl.distributed import STORE_VARIABLE
+
     # The store, in which processes find each other, is this process's own, so that its port cannot
     # be taken by others in between.
     store = torch.distributed.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
-    shared = {**os.environ, **(environment or {}), "MJLAB_PROCESS_STORE": f"127.0.0.1:{store.port}"}
+    shared = {**os.environ, **(environment or {}), STORE_VARIABLE: f"127.0.0.1:{store.port}"}
     shared.setdefault("OMP_NUM_THREADS", str(max(1, cores_per_process() // count)))
     numbers = {"WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count)}
     workers: list[subprocess.Popen[bytes]] = []

@@ -37,7 +37,7 @@ class PolicyFlags:
     agent: Literal["zero", "random", "trained"] = "trained"
     """Who acts: all-zero actions, uniform ones in [-1, 1], or a trained policy."""
     checkpoint_file: str | None = None
-    """Checkpoint of the trained policy; None takes the newest of the task."""
+    """Checkpoint of the trained policy, or its export (`.onnx`); None takes the task's newest."""
     wandb_run_path: str | None = None
     """Weights & Biases run to take the policy from, as entity/project/run."""
     wandb_checkpoint_name: str | None = None
@@ -77,11 +77,20 @@ def load_policy(
 ) -> Any:
     """Return the deterministic policy in `checkpoint`, for the wrapped environment `env`.
 
-    `profile` is the profile of the task that it was trained with.
+    Args:
+        task: Name of the task.
+        env: The wrapped environment.
+        checkpoint: A checkpoint, or an exported policy (`.onnx`).
+        device: Torch device of the policy.
+        profile: Profile of the task that it was trained with.
 
     Raises:
         CheckpointError: the file is missing, damaged, or holds another network.
     """
+    if checkpoint.suffix == ".onnx":
+        from mjlab.rl.onnx_policy import load_onnx_policy
+
+        return load_onnx_policy(checkpoint, env, device)
     from mjlab.rl import MjlabOnPolicyRunner
 
     runner_cls: Any = load_runner_cls(task) or MjlabOnPolicyRunner

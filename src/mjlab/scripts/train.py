@@ -17,6 +17,7 @@ _USAGE = task_usage(
         "train Mjlab-Cartpole-Swingup --num-envs 4096",
         "train Mjlab-Cartpole-Swingup --agent.algorithm.learning-rate 3e-4 --agent.seed 1",
         "train Mjlab-Cartpole-Swingup --agent.resume True",
+        "train Mjlab-Velocity-Flat-Unitree-Go1 --profile cpu",
     ],
 )
 

@@ -89,6 +89,8 @@ def _find_literal(where: str, match: ContactMatch, scene_spec: mujoco.MjSpec) ->
                 f"ContactMatch.entity, a name is taken literally.{_close_names(name, names)} "
                 f"It has: {names}."
             )
+    if len(set(match.patterns)) != len(match.patterns):
+        raise ValueError(f"{where} names an element twice: {match.pattern!r}.")
     if match.exclude:
         logger.warning("%s: exclude has no effect without ContactMatch.entity.", where)
     return [Matched(name, name) for name in match.patterns]

@@ -19,11 +19,10 @@ _KINDS = {
     "site": ("site_xpos", "site_xmat", mujoco.mjtObj.mjOBJ_SITE),
     "geom": ("geom_xpos", "geom_xmat", mujoco.mjtObj.mjOBJ_GEOM),
 }
-_PLURALS = {"body": "bodies", "site": "sites", "geom": "geoms"}
 
 
-def check_frames(frames: tuple[ObjRef, ...], spec: mujoco.MjSpec, entities: dict[str, Entity]):
-    """Raise ValueError unless all `frames` are bodies, sites or geoms that the spec has."""
+def check_frames(frames: tuple[ObjRef, ...], entities: dict[str, Entity]) -> None:
+    """Raise ValueError unless all `frames` are bodies, sites or geoms, of entities there are."""
     if not frames:
         raise ValueError("frame is empty; give one ObjRef or several.")
     for frame in frames:
@@ -37,14 +36,21 @@ def check_frames(frames: tuple[ObjRef, ...], spec: mujoco.MjSpec, entities: dict
                 f"frame {frame.name!r} refers to the entity {frame.entity!r}. The scene has: "
                 f"{sorted(entities)}."
             )
-        prefix = f"{frame.entity}/" if frame.entity else ""
-        names = [element.name for element in getattr(spec, _PLURALS[frame.type])]
-        if not frame.name or frame.prefixed_name() not in names:
-            own = [n.removeprefix(prefix) for n in names if n and n.startswith(prefix)]
-            close = difflib.get_close_matches(frame.name, own, n=3)
-            hint = f"Close names: {', '.join(close)}." if close else f"It has: {own}."
-            owner = f"Entity {frame.entity!r}" if frame.entity else "The scene"
-            raise ValueError(f"{owner} has no {frame.type} {frame.name!r}. {hint}")
+
+
+def _find(frame: ObjRef, mj_model: mujoco.MjModel) -> int:
+    """Return the id of a frame; ValueError with close names if there is none."""
+    index = mujoco.mj_name2id(mj_model, _KINDS[frame.type][2], frame.prefixed_name())
+    if index >= 0:
+        return index
+    accessor = getattr(mj_model, frame.type)
+    names = [accessor(i).name for i in range(getattr(mj_model, f"n{frame.type}"))]
+    prefix = f"{frame.entity}/" if frame.entity else ""
+    own = [name.removeprefix(prefix) for name in names if name and name.startswith(prefix)]
+    close = difflib.get_close_matches(frame.name, own, n=3)
+    hint = f"Close names: {', '.join(close)}." if close else f"It has: {own}."
+    owner = f"Entity {frame.entity!r}" if frame.entity else "The scene"
+    raise ValueError(f"{owner} has no {frame.type} {frame.name!r}. {hint}")
 
 
 class Frames:
@@ -53,13 +59,14 @@ class Frames:
     def __init__(
         self, frames: tuple[ObjRef, ...], mj_model: mujoco.MjModel, data: Any, device: str
     ) -> None:
+        """Find the frames; ValueError with close names for one that does not exist."""
         self._data = data
         self._parts: list[tuple[str, str, torch.Tensor, torch.Tensor]] = []
         self.body_ids: list[int] = []
         """The body that carries each frame."""
         ids = []
         for frame in frames:
-            index = mujoco.mj_name2id(mj_model, _KINDS[frame.type][2], frame.prefixed_name())
+            index = _find(frame, mj_model)
             ids.append(index)
             owners = {"site": mj_model.site_bodyid, "geom": mj_model.geom_bodyid}
             self.body_ids.append(index if frame.type == "body" else int(owners[frame.type][index]))

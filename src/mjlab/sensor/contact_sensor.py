@@ -10,6 +10,7 @@ import torch
 
 from mjlab.sensor._contact_clocks import ContactClocks
 from mjlab.sensor._contact_debug import draw_contacts
+from mjlab.sensor._contact_history import ContactHistory
 from mjlab.sensor._contact_layout import FIELD_SIZES, ContactLayout, to_world
 from mjlab.sensor._contact_names import Matched, find_matches
 from mjlab.sensor.sensor import Sensor, SensorCfg
@@ -184,9 +185,7 @@ class ContactSensor(Sensor[ContactData]):
     that all reading and recording is of one block.
     """
 
-    _transient = {
-        "_primary_names", "_layout", "_fields", "_records", "_sim_data", "_source", "_found_view", "_slots", "_orders",
-    }  # fmt: skip
+    _transient = {"_primary_names", "_layout", "_fields", "_records", "_source", "_found_view"}
 
     def __init__(self, cfg: ContactSensorCfg) -> None:
         super().__init__()
@@ -199,11 +198,7 @@ class ContactSensor(Sensor[ContactData]):
         self._sim_data: Any = None
         self._source: torch.Tensor | None = None
         self._found_view: torch.Tensor | None = None
-        # Raw blocks of the last substeps; `_head` is the newest, older ones follow it cyclically.
-        self._ring: torch.Tensor | None = None
-        self._head = 0
-        self._slots: list[torch.Tensor] = []
-        self._orders: list[torch.Tensor] = []
+        self._history: ContactHistory | None = None
         self._clocks: ContactClocks | None = None
 
     @property
@@ -283,11 +278,8 @@ class ContactSensor(Sensor[ContactData]):
         self._source = self._found_view = None
         num_envs = data.qpos.shape[0]
         if self._records:
-            length = cfg.history_length
-            self._ring = torch.zeros(length, num_envs, self._layout.width, device=device)
-            self._slots = list(self._ring.unbind())
-            slots = torch.arange(length, device=device)
-            self._orders = [slots.roll(-head) for head in range(length)]
+            width = self._layout.width
+            self._history = ContactHistory(cfg.history_length, num_envs, width, device)
         if cfg.track_air_time:
             self._clocks = ContactClocks(num_envs, len(self._primary_names), device)
         if self.needs_substep:
@@ -300,9 +292,8 @@ class ContactSensor(Sensor[ContactData]):
     def update(self, dt: float) -> None:
         """Record what the last physics substep, of `dt` seconds, has measured."""
         self.invalidate_cache()
-        if self._ring is not None:
-            self._head = (self._head - 1) % len(self._slots)
-            self._slots[self._head].copy_(self._block())
+        if self._history is not None:
+            self._history.record(self._block())
         if self._clocks is not None:
             self._clocks.update(self._found() > 0.0, dt)
 
@@ -310,8 +301,8 @@ class ContactSensor(Sensor[ContactData]):
         """Clear history and clocks of these environments; None means all."""
         self.invalidate_cache()
         rows = slice(None) if env_ids is None else env_ids
-        if self._ring is not None:
-            self._ring[:, rows] = 0.0
+        if self._history is not None:
+            self._history.reset(rows)
         if self._clocks is not None:
             self._clocks.reset(rows)
 
@@ -335,8 +326,8 @@ class ContactSensor(Sensor[ContactData]):
         # A copy, so that what a term keeps of one step does not change in the next.
         values = self._fields_of(self._block().clone())
         data = ContactData(**{name: values[name] for name in self.cfg.fields})
-        if self._ring is not None:
-            recorded = self._fields_of(self._ring.index_select(0, self._orders[self._head]))
+        if self._history is not None:
+            recorded = self._fields_of(self._history.newest_first())
             for name in _HISTORY_FIELDS:
                 if name in self.cfg.fields:
                     setattr(data, f"{name}_history", recorded[name].movedim(0, 2))

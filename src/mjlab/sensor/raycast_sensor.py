@@ -141,14 +141,14 @@ class RayCastSensor(Sensor[RayCastData]):
     # Construction.
 
     def edit_spec(self, scene_spec: mujoco.MjSpec, entities: dict[str, Entity]) -> None:
-        """Check that the frames exist; the spec stays as it is.
+        """Check what the frames refer to; the spec stays as it is.
 
         Raises:
-            ValueError: no frame, one that is no body, site or geom, or one that does not exist
-                (with close names).
+            ValueError: no frame, one that is no body, site or geom, or one of an entity that does
+                not exist.
         """
         try:
-            check_frames(self._frame_refs, scene_spec, entities)
+            check_frames(self._frame_refs, entities)
         except ValueError as error:
             raise self._error(str(error)) from error
 
@@ -156,17 +156,18 @@ class RayCastSensor(Sensor[RayCastData]):
         """Generate the rays and find the frames in the compiled model.
 
         Raises:
-            ValueError: the pattern has no rays or makes no sense.
+            ValueError: the pattern has no rays or makes no sense, or a frame does not exist (with
+                close names).
         """
         try:
             offsets, directions = self.cfg.pattern.generate_rays(mj_model, device)
+            self._frames = Frames(self._frame_refs, mj_model, data, device)
         except ValueError as error:
             raise self._error(str(error)) from error
         if len(offsets) == 0:
             raise self._error("its pattern has no rays.")
         self._offsets, self._local_directions = offsets, directions
         self._num_rays_per_frame = len(offsets)
-        self._frames = Frames(self._frame_refs, mj_model, data, device)
         self._moving_directions = not is_constant(directions, self.cfg.ray_alignment)
         shape = (data.qpos.shape[0], self.num_frames)
         self._frame_pos = torch.zeros(*shape, 3, device=device)

@@ -18,6 +18,8 @@ from mjlab.terrains.terrain_generator import SubTerrainCfg, TerrainGeometry, Ter
 MIN_BASE_THICKNESS = 0.5
 # How far around the centre a robot may be placed, and how far it may reach.
 SPAWN_RADIUS = 1.0
+# A mistyped pixel size should be told, rather than fill the memory.
+_MAX_PIXELS = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,13 @@ def divide_into_pixels(cfg: SubTerrainCfg, pixel_field: str = "horizontal_scale"
         "size",
         f"with {pixel_field} = {pixel:g} and border_width = {border_width:g} that leaves less than "
         "2 x 2 pixels of ground. Make it larger, or the pixels or the border smaller.",
+    )
+    refuse_unless(
+        rows * cols <= _MAX_PIXELS,
+        cfg,
+        pixel_field,
+        f"that makes {rows * cols:,} pixels of {tuple(cfg.size)} m. Use larger ones; at most "
+        f"{_MAX_PIXELS:,} are allowed.",
     )
     if border == 0:
         return Pixels(rows, cols, 0, (cfg.size[0], cfg.size[1]))

@@ -20,6 +20,8 @@ from mjlab.utils.color import brand_ramp
 
 # Stones that the frame leaves less than this are dropped, in metres.
 _MIN_STONE = 0.05
+# Beams shorter than this are dropped, in metres: the platform reaches the frame there.
+_MIN_BEAM = 0.01
 
 
 @dataclass(kw_only=True)
@@ -158,6 +160,8 @@ class BoxNarrowBeamsTerrainCfg(SubTerrainCfg):
         for index in range(self.num_beams):
             angle = 2.0 * math.pi * index / self.num_beams
             length = self._reach(angle, width) - radius
+            if length < _MIN_BEAM:
+                continue
             middle = radius + length / 2
             place = (
                 boxes.center[0] + middle * math.cos(angle),

@@ -8,11 +8,13 @@ Each is authored with its low corner at the origin, and z is that of the world.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import mujoco
 import numpy as np
 
+from mjlab.terrains._field_obstacles import (
+    HfDiscreteObstaclesTerrainCfg as HfDiscreteObstaclesTerrainCfg,
+)
 from mjlab.terrains._fields import (
     lerp,
     refuse_unless,
@@ -32,8 +34,6 @@ from mjlab.terrains._perlin import fractal_noise
 from mjlab.terrains._resample import interpolate_cubic
 from mjlab.terrains.terrain_generator import SubTerrainCfg, TerrainOutput
 
-# Obstacles stand, and their footprints grow, in steps of this many pixels.
-_OBSTACLE_STEP = 4
 # A field of Perlin noise is at least this high, in metres.
 _MIN_PERLIN_HEIGHT = 0.001
 
@@ -187,6 +187,12 @@ class HfWaveTerrainCfg(SubTerrainCfg):
         pixels = divide_into_pixels(self)
         refuse_unless_range(self, "amplitude_range", lowest=0.0)
         refuse_unless(self.num_waves > 0, self, "num_waves", "it must be at least 1.")
+        refuse_unless(
+            2 * self.num_waves <= pixels.inner[0],
+            self,
+            "num_waves",
+            f"{pixels.inner[0]} pixels along y can show at most {pixels.inner[0] // 2}.",
+        )
         amplitude = int(0.5 * lerp(self.amplitude_range, difficulty) / self.vertical_scale)
         rows, cols = pixels.inner
         turn = 2.0 * np.pi * self.num_waves / rows
@@ -194,84 +200,6 @@ class HfWaveTerrainCfg(SubTerrainCfg):
         noise = pixels.with_border(np.rint(amplitude * raw).astype(int))
         field = add_noise(self, spec, noise)
         return finish(self, field, field.highest_near_centre(), rng)
-
-
-@dataclass(kw_only=True)
-class HfDiscreteObstaclesTerrainCfg(SubTerrainCfg):
-    """Blocks and pits of random sizes at random places."""
-
-    obstacle_height_mode: Literal["choice", "fixed"] = "choice"
-    """`fixed` gives every obstacle the full height; `choice` draws from the full and half height,
-    up and down."""
-    obstacle_width_range: tuple[float, float]
-    """Smallest and largest side of an obstacle, in metres."""
-    obstacle_height_range: tuple[float, float]
-    """Full height of obstacles at difficulty 0 and 1, in metres."""
-    num_obstacles: int
-    """Number of obstacles; later ones overwrite earlier ones."""
-    platform_width: float = 1.0
-    """Side of the square at the centre that is cleared, in metres."""
-    horizontal_scale: float = 0.1
-    """Size of a pixel, in metres."""
-    vertical_scale: float = 0.005
-    """Step of heights, in metres."""
-    base_thickness_ratio: float = 1.0
-    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
-    border_width: float = 0.0
-    """Width of the flat border, in metres: 0, or at least one pixel."""
-    square_obstacles: bool = False
-    """Whether obstacles are as long as they are wide."""
-    origin_z_offset: float = 0.0
-    """How far above the platform robots start, in metres."""
-
-    def function(
-        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
-    ) -> TerrainOutput:
-        """Add the terrain; robots start on the platform.
-
-        Obstacles begin at every fourth pixel inside the border, and are cut off where it ends.
-        """
-        self._check_obstacles()
-        pixels = divide_into_pixels(self)
-        refuse_unless_platform_fits(self)
-        full = int(lerp(self.obstacle_height_range, difficulty) / self.vertical_scale)
-        heights = [full] if self.obstacle_height_mode == "fixed" else _levels(full)
-        narrow, wide = (int(width / self.horizontal_scale) for width in self.obstacle_width_range)
-        sides = np.arange(narrow, wide + 1, _OBSTACLE_STEP)
-        inner = np.zeros(pixels.inner, dtype=int)
-        starts = [np.arange(0, count, _OBSTACLE_STEP) for count in pixels.inner]
-        for _ in range(self.num_obstacles):
-            height, width = rng.choice(heights), rng.choice(sides)
-            length = width if self.square_obstacles else rng.choice(sides)
-            row, col = (rng.choice(start) for start in starts)
-            inner[row : row + width, col : col + length] = height
-        noise = pixels.with_border(inner)
-        half = int(self.platform_width / self.horizontal_scale) // 2
-        row, col = pixels.rows // 2, pixels.cols // 2
-        noise[row - half : row + half, col - half : col + half] = 0
-        field = add_noise(self, spec, noise)
-        # Without a platform robots stand on whatever there is at the centre.
-        around = max(half, 1)
-        ground = field.surface[row - around : row + around, col - around : col + around].max()
-        return finish(self, field, float(ground) + self.origin_z_offset, rng)
-
-    def _check_obstacles(self) -> None:
-        """Raise `ValueError` for obstacles that cannot be made."""
-        check_heightfield(self, "vertical_scale")
-        refuse_unless(
-            self.obstacle_height_mode in ("choice", "fixed"),
-            self,
-            "obstacle_height_mode",
-            "it must be 'choice' or 'fixed'.",
-        )
-        refuse_unless_range(self, "obstacle_width_range", lowest=self.horizontal_scale)
-        refuse_unless_range(self, "obstacle_height_range", lowest=0.0)
-        refuse_unless(self.num_obstacles >= 0, self, "num_obstacles", "it must not be negative.")
-
-
-def _levels(full: int) -> list[int]:
-    """Return what `choice` draws from, in units of `vertical_scale`."""
-    return [-full, -full // 2, full // 2, full]
 
 
 @dataclass(kw_only=True)
@@ -307,6 +235,13 @@ class HfPerlinNoiseTerrainCfg(SubTerrainCfg):
         refuse_unless_range(self, "height_range", lowest=0.0)
         pixels = divide_into_pixels(self, "resolution")
         frequency = self.scale * self.resolution / self.horizontal_scale
+        refuse_unless(
+            2 * frequency <= min(pixels.inner),
+            self,
+            "scale",
+            f"that makes {frequency:g} hills along each side, but {min(pixels.inner)} pixels can "
+            f"show at most {min(pixels.inner) // 2}.",
+        )
         noise = fractal_noise(
             pixels.inner, frequency, self.octaves, self.persistence, self.lacunarity, rng
         )

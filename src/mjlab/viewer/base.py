@@ -24,7 +24,9 @@ from mjlab.viewer.protocols import ViewerStatus as ViewerStatus
 
 log = logging.getLogger(__name__)
 
-_IDLE_SLEEP_S = 0.001
+# Longest sleep between two looks at what is due, so that buttons answer at once.
+_MAX_SLEEP_S = 0.005
+_MIN_SLEEP_S = 0.0005
 
 
 class BaseViewer(ABC):
@@ -126,7 +128,7 @@ class BaseViewer(ABC):
                 self._rates.restart(self._last_tick)
                 while self.is_running() and not self._should_stop():
                     if not self.tick():
-                        time.sleep(_IDLE_SLEEP_S)
+                        time.sleep(self._time_until_due())
             finally:
                 self.close()
 
@@ -173,6 +175,13 @@ class BaseViewer(ABC):
             if time.perf_counter() >= deadline:
                 self._pacer.out_of_time()
                 return
+
+    def _time_until_due(self) -> float:
+        """Seconds until the next step or frame, within the bounds of a sleep."""
+        due = self._next_frame - time.perf_counter()
+        if not self._paused:
+            due = min(due, self._pacer.time_to_next_step)
+        return min(max(due, _MIN_SLEEP_S), _MAX_SLEEP_S)
 
     def _show_frame_if_due(self) -> bool:
         now = time.perf_counter()

@@ -53,6 +53,11 @@ class RealtimePacer:
         self._budget = max(self._budget - self.step_dt, 0.0)
         return True
 
+    @property
+    def time_to_next_step(self) -> float:
+        """Wall time in seconds until the budget is enough for a step."""
+        return max(self.step_dt - self._budget, 0.0) / self.speed
+
     def out_of_time(self) -> None:
         """Say that this frame's wall time is used up; what is left is cut to one step."""
         self.capped = self._budget >= self.step_dt

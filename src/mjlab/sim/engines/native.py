@@ -24,6 +24,8 @@ from mjlab.sim.engines.field_lists import (
     INPUTS,
     ZERO_INPUTS,
 )
+from mjlab.sim.engines.native_midphase import FIELDS as MIDPHASE_FIELDS
+from mjlab.sim.engines.native_midphase import MidphaseMargins
 from mjlab.sim.engines.native_rays import NativeRays
 from mjlab.sim.engines.sensor_fed import refuse_without_sensor
 
@@ -81,6 +83,7 @@ class NativeEngine(Engine):
         self._tensors: dict[str, torch.Tensor] = {}
         self._model_arrays: dict[str, np.ndarray] = {}
         self._model_tensors: dict[str, torch.Tensor] = {}
+        self._midphase: MidphaseMargins | None = None
         for name in _ALWAYS_BOUND:
             self._bind(name)
         self._qpos0 = torch.from_numpy(self._model.qpos0.astype(np.float32))
@@ -126,6 +129,7 @@ class NativeEngine(Engine):
             self._arrays[name][:] = values
 
     def _forward_keeping_warm_start(self) -> None:
+        self._refresh_midphase()
         rows = self._batch.bind("state")
         warm_start = rows[:, self._warm_start].copy()
         self._batch.forward()
@@ -158,7 +162,11 @@ class NativeEngine(Engine):
                     self._model_arrays[mark][:] = 0
             array = _as_float32(self._batch.expand, name, "MjModel")
             self._model_arrays[name] = array
-            self._model_tensors[name] = _as_tensor(name, array)
+            # Whether a tensor made in inference mode was written cannot be seen afterwards.
+            with torch.inference_mode(False):
+                self._model_tensors[name] = _as_tensor(name, array)
+            if name in MIDPHASE_FIELDS and self._midphase is None:
+                self._midphase = MidphaseMargins(self._model, self.num_envs, self._batch.expand)
 
     def _check_expandable(self, name: str) -> None:
         if name in _STRUCTURAL_FIELDS:
@@ -180,13 +188,19 @@ class NativeEngine(Engine):
     # Physics.
 
     def step(self, nstep: int) -> None:
+        self._refresh_midphase()
         self._batch.step(nstep=nstep)
 
     def forward(self, env_ids: torch.Tensor | None) -> None:
         # Where nobody reads a derived field there is nothing to make current. One that is read
         # later is computed then.
         if self._derived:
+            self._refresh_midphase()
             self._batch.forward(_as_ids(env_ids))
+
+    def _refresh_midphase(self) -> None:
+        if self._midphase is not None:
+            self._midphase.refresh(self._model_tensors)
 
     def reset(self, env_ids: torch.Tensor | None) -> None:
         # Written through the bound copies and not with Batch.reset, which would keep writes that
@@ -313,6 +327,7 @@ class NativeEngine(Engine):
         self.expand(tuple(state["model"]))
         for name, value in state["model"].items():
             self._model_tensors[name].copy_(value)
+        self._refresh_midphase()
         rows[:] = saved
         self._batch.forward()
         # The forward pass has set the solver's warm start anew; put back the saved one.

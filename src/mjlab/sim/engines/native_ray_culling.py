@@ -36,9 +36,7 @@ class CullingRule:
         self._mat = np.append(mat.reshape(-1, 3, 3), np.zeros((1, 3, 3)), axis=0)
         self._is_upright = bool((self._mat[self._is_field, 2, 2] > 1.0 - 1e-12).all())
         elevation = np.zeros(model.ngeom + 1)
-        elevation[self._is_field] = model.hfield_size[
-            model.geom_dataid[self._is_field[:-1]], 2
-        ]
+        elevation[self._is_field] = model.hfield_size[model.geom_dataid[self._is_field[:-1]], 2]
         self._elevation = elevation
         self._base = np.where(self._is_field, self._pos[:, 2], np.nan)
 

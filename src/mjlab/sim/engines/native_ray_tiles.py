@@ -150,7 +150,9 @@ class TileTable:
         place = np.floor((centre - self.origin) / self.pitch)
         inside = ((place >= 0) & (place < self.shape)).all(axis=-1)
         index = np.where(inside[..., None], place, 0.0).astype(np.int64)
-        return np.where(inside, index[..., 0] * self.shape[1] + index[..., 1], len(self.entries) - 1)
+        return np.where(
+            inside, index[..., 0] * self.shape[1] + index[..., 1], len(self.entries) - 1
+        )
 
 
 def slot_model(model: mujoco.MjModel, slot_types: list[int]) -> mujoco.MjModel:

@@ -31,8 +31,10 @@ MakeBatch = Callable[[mujoco.MjModel, int], Any]
 
 # Fewer static geoms than this are tried faster than they are looked up.
 _MIN_GEOMS = 12
-# Windows that reach farther (metres) hold most of the geoms anyway.
+# Windows that reach farther (metres) hold most of the geoms anyway. So many calls later, the rays
+# may be closer together.
 _MAX_MARGIN = 4.0
+_PAUSE = 100
 # If more of the environments than this have rays that left their window, windows are made larger.
 _MAX_STRAYS = 0.02
 
@@ -102,9 +104,7 @@ class NativeRays:
         """Cast against the geoms of the model itself, in the environments `envs` (None: all)."""
 
         def passed(rows: Any, origins: Array, directions: Array, hits: Hits) -> Array:
-            return self._rule.passed(
-                origins, directions, hits.distances, hits.normals, hits.geoms
-            )
+            return self._rule.passed(origins, directions, hits.distances, hits.normals, hits.geoms)
 
         cast_through(
             self._batch,
@@ -127,9 +127,10 @@ class NativeRays:
         hits: Hits,
     ) -> None:
         """Cast against the static geoms that are near, and then against those that move."""
-        if not plan.parts:
+        if not plan.parts and plan.pause == 0:
             self._build(plan, origins, directions, reach)
-        if plan.nearby is None:
+        if not plan.parts:
+            plan.pause -= 1
             self._cast_all(plan, origins, directions, hits)
             return
         strayed = np.zeros(len(origins), dtype=bool)
@@ -157,28 +158,32 @@ class NativeRays:
         _, sources = np.unique(np.stack((limit, excluded)), axis=1, return_inverse=True)
         ends = (origins + (directions * torch.from_numpy(limit)[:, None]).nan_to_num()).numpy()
         starts = origins.numpy()
-        plan.slack *= 1.5
-        for clusters in cluster_rays(starts[0], sources.reshape(-1)):
-            extents = []
-            for rays in clusters:
-                points = np.concatenate((starts[:, rays, :2], ends[:, rays, :2]), axis=1)
-                extents.append(np.linalg.norm(np.ptp(points, axis=1) / 2, axis=-1))
-            margin = plan.slack * float(np.quantile(extents, 0.99)) + 0.02
-            if not margin < _MAX_MARGIN:
-                plan.nearby = None
-                return
-            assert plan.nearby is not None
-            plan.parts.append(
-                NearbyRays(
-                    clusters,
-                    len(starts),
-                    plan.nearby,
-                    margin,
-                    self._make_batch,
-                    self._model,
-                    self._rule if plan.is_one_sided else None,
-                )
+        classes = cluster_rays(starts[0], sources.reshape(-1))
+        margins = [_margin(clusters, starts, ends) for clusters in classes]
+        if len(margins) == len(plan.margins):
+            margins = [max(pair) for pair in zip(margins, plan.margins, strict=True)]
+        if not max(margins) < _MAX_MARGIN:
+            plan.pause = _PAUSE
+            return
+        assert plan.nearby is not None
+        rule = self._rule if plan.is_one_sided else None
+        plan.margins = margins
+        plan.parts = [
+            NearbyRays(
+                clusters, len(starts), plan.nearby, margin, self._make_batch, self._model, rule
             )
+            for clusters, margin in zip(classes, margins, strict=True)
+        ]
+
+
+def _margin(clusters: list[Array], starts: Array, ends: Array) -> float:
+    """Return how far windows have to reach around clusters, for nearly all environments."""
+    extents = []
+    for rays in clusters:
+        points = np.concatenate((starts[:, rays, :2], ends[:, rays, :2]), axis=1)
+        # Half the diagonal, which turning does not change.
+        extents.append(np.linalg.norm(np.ptp(points, axis=1) / 2, axis=-1))
+    return 1.2 * float(np.quantile(np.max(extents, axis=0), 0.99)) + 0.02
 
 
 class _Plan:
@@ -200,8 +205,9 @@ class _Plan:
         visible = visible_geoms(model, groups)
         self.is_one_sided = rule.concerns(visible)
         self.is_new = True
+        self.pause = 0
         self.parts: list[NearbyRays] = []
-        self.slack = 0.8
+        self.margins: list[float] = []
         near = visible & is_static(model) & movable_kind(model)
         others = visible & ~near
         self.has_moving = bool(others.any())

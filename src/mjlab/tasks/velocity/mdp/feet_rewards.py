@@ -136,7 +136,8 @@ class feet_swing_height:
         params = cfg.params
         contact, height = params["sensor_name"], params["height_sensor_name"]
         require_command(env, params["command_name"])
-        check_landing_sensor(env, contact)
+        check_air_time_sensor(env, contact)
+        check_feet_sensor(env, contact)
         if not params["target_height"] > 0.0:
             raise ValueError(
                 f"target_height is {params['target_height']!r}; heights are compared with it, so "

@@ -7,22 +7,18 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.managers.build_checks import checked_when_built
-from mjlab.sensor import TerrainHeightSensor
 from mjlab.tasks.velocity.mdp.sensor_checks import (
     check_air_time_sensor,
-    check_contact_sensor,
-    require_sensor,
+    check_force_sensor,
+    check_found_sensor,
+    check_height_sensor,
 )
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
 
-def _check_height(env: ManagerBasedRlEnv, sensor_name: str) -> None:
-    require_sensor(env, sensor_name, TerrainHeightSensor)
-
-
-@checked_when_built(_check_height)
+@checked_when_built(check_height_sensor)
 def foot_height(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
     """Height of each foot above the ground (m), (N, feet), from a height sensor."""
     return env.scene[sensor_name].data.heights
@@ -34,13 +30,13 @@ def foot_air_time(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
     return env.scene[sensor_name].data.current_air_time
 
 
-@checked_when_built(check_contact_sensor)
+@checked_when_built(check_found_sensor)
 def foot_contact(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
     """1 for each foot that touches the ground, else 0, (N, feet)."""
     return (env.scene[sensor_name].data.found > 0).float()
 
 
-@checked_when_built(check_contact_sensor)
+@checked_when_built(check_force_sensor)
 def foot_contact_forces(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
     """Contact forces as `sign(f) ln(1 + |f|)`, (N, 3 feet): x, y, z of the first foot, and so on.
 

@@ -70,29 +70,53 @@ def check_builtin_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> 
         )
 
 
-def check_contact_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
-    """Check a term that asks whether there was contact, with a force if the sensor keeps one."""
-    cfg = require_sensor(env, sensor_name, ContactSensor).cfg
-    if not {"found", "force"} & set(cfg.fields):
+def _require_fields(sensor: ContactSensor, *fields: str) -> None:
+    missing = [field for field in fields if field not in sensor.cfg.fields]
+    if missing:
         raise ValueError(
-            f"The contact sensor {sensor_name!r} has the fields {tuple(cfg.fields)}; it needs "
-            "'found' or 'force'."
+            f"The contact sensor {sensor.cfg.name!r} has no {missing}. Add them to its fields, "
+            f"which are {tuple(sensor.cfg.fields)}."
         )
 
 
-def check_air_time_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> ContactSensor:
-    """Check a term that reads air times or landings of feet; return the sensor."""
+def check_contact_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
+    """Check a term that counts contacts, or forces in a history."""
     sensor = require_sensor(env, sensor_name, ContactSensor)
-    if not sensor.cfg.track_air_time:
+    has_history = sensor.cfg.history_length > 0 and "force" in sensor.cfg.fields
+    if not has_history:
+        _require_fields(sensor, "found")
+
+
+def check_found_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
+    """Check a term that asks whether there is contact."""
+    _require_fields(require_sensor(env, sensor_name, ContactSensor), "found")
+
+
+def check_force_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
+    """Check a term that reads forces of contacts."""
+    _require_fields(require_sensor(env, sensor_name, ContactSensor), "force")
+
+
+def check_air_time_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
+    """Check a term that reads air times, or landings of feet."""
+    if not require_sensor(env, sensor_name, ContactSensor).cfg.track_air_time:
         raise ValueError(
             f"The contact sensor {sensor_name!r} does not track air time. Set track_air_time=True "
             "in its config."
         )
-    return sensor
 
 
-def check_feet_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> ContactSensor:
-    """Check a term that reads one contact for each foot; return the sensor."""
+def check_height_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
+    """Check a term that reads one height for each foot."""
+    if require_sensor(env, sensor_name, TerrainHeightSensor).cfg.reduction == "none":
+        raise ValueError(
+            f"The height sensor {sensor_name!r} has reduction='none', one height for each ray. "
+            "One for each foot is needed: 'min', 'max' or 'mean'."
+        )
+
+
+def check_feet_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
+    """Check a term that reads one contact for each foot."""
     sensor = require_sensor(env, sensor_name, ContactSensor)
     if sensor.cfg.num_slots != 1:
         raise ValueError(
@@ -100,18 +124,14 @@ def check_feet_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> Con
             "and the term needs one. Set num_slots=1, with reduce='netforce' for the sum of all "
             "contacts of a foot."
         )
-    missing = {"found", "force"} - set(sensor.cfg.fields)
-    if missing:
-        raise ValueError(
-            f"The contact sensor {sensor_name!r} has no {sorted(missing)}. Add them to its fields."
-        )
-    return sensor
+    _require_fields(sensor, "found")
 
 
 def check_landing_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
     """Check a term that reads the force with which feet land."""
     check_air_time_sensor(env, sensor_name)
     check_feet_sensor(env, sensor_name)
+    check_force_sensor(env, sensor_name)
 
 
 # Feet: columns of different sources that are multiplied with each other.
@@ -127,13 +147,8 @@ def contact_columns(env: ManagerBasedRlEnv, sensor_name: str) -> list[tuple[str,
 
 def height_columns(env: ManagerBasedRlEnv, sensor_name: str) -> list[tuple[str, int]]:
     """Return name and body of each column of a height sensor: its frames, in order."""
-    sensor = require_sensor(env, sensor_name, TerrainHeightSensor)
-    if sensor.cfg.reduction == "none":
-        raise ValueError(
-            f"The height sensor {sensor_name!r} has reduction='none', one height for each ray. "
-            "One for each foot is needed: 'min', 'max' or 'mean'."
-        )
-    frame = sensor.cfg.frame
+    check_height_sensor(env, sensor_name)
+    frame = require_sensor(env, sensor_name, TerrainHeightSensor).cfg.frame
     frames = frame if isinstance(frame, tuple) else (frame,)
     return [_element(env, ref.type, ref.name, ref.entity) for ref in frames]
 

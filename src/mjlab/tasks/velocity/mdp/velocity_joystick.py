@@ -40,7 +40,9 @@ class VelocityJoystick:
         self._sliders: list[Any] = []
         with server.gui.add_folder(name.capitalize()):
             self._enabled = server.gui.add_checkbox(
-                "Enable", False, hint="Command the environment in view by these sliders."
+                "Enable",
+                False,
+                hint="Command the environment in view by these sliders. Moving one enables them.",
             )
             for component in _COMPONENTS:
                 self._sliders.append(self._add_slider(server, component, ranges))
@@ -54,7 +56,7 @@ class VelocityJoystick:
         limit = min(max(abs(bound) for bound in (*getattr(ranges, component), low)), high)
         slider = server.gui.add_slider(component, -limit, limit, _STEP, 0.0)
         maximum = server.gui.add_slider(f"Max {component}", low, high, 0.1, limit)
-        slider.on_update(self._changed)
+        slider.on_update(self._moved)
 
         @maximum.on_update
         def _(_event: Any) -> None:
@@ -73,6 +75,12 @@ class VelocityJoystick:
     def _zero(self, _event: Any) -> None:
         for slider in self._sliders:
             slider.value = 0.0
+
+    def _moved(self, event: Any) -> None:
+        # Whoever moves a slider wants to drive; `Zero` and `Max` move them without a person.
+        if event.client is not None and not self._enabled.value:
+            self._enabled.value = True
+        self._changed(event)
 
     def _changed(self, _event: Any) -> None:
         if self._on_change is not None:

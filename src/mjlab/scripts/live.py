@@ -1,0 +1,207 @@
+"""`train --live`: shows the policy as it learns, from a process that training does not wait for.
+
+Training hands over the newest weights through a file, at the end of an iteration and only while a
+browser is connected. All else, the page, an environment of its own and the policy in it, lives in
+the other process (`mjlab.scripts.live_view`), which takes processor time that training leaves.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import logging
+import os
+import pickle
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mjlab.rl.progress import IterationStats, TrainingObserver
+from mjlab.scripts.cli import UserError
+
+if TYPE_CHECKING:
+    from mjlab.rl import MjlabOnPolicyRunner
+    from mjlab.scripts.train_run import TrainConfig
+
+logger = logging.getLogger(__name__)
+
+# Handing over weights takes some milliseconds. Iterations can be shorter than that, so it is done
+# at most this often, and never for more than this share of the time.
+_SECONDS_BETWEEN_WEIGHTS = 1.0
+_LARGEST_SHARE = 0.01
+
+_NUM_ENVS = 4
+_SECONDS_TO_START = 20.0
+_SECONDS_TO_END = 3.0
+# What would make the view's process one of the training processes of `torchrun`.
+_DISTRIBUTED = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "TORCHELASTIC_RUN_ID")
+
+
+class Exchange:
+    """The folder in which training and the view leave things for each other."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.url = folder / "url"
+        """Where the page is, once it is there."""
+        self.watched = folder / "watched"
+        """Exists while a browser is connected."""
+        self.weights = folder / "weights.pt"
+        """The newest policy and the figures of its iteration; it appears whole or not at all."""
+        self.log = folder / "log.txt"
+        """What the view's process printed."""
+
+    def write_weights(self, policy: Any, stats: IterationStats | None) -> None:
+        """Leave a policy's state, and the figures of the iteration that it comes from."""
+        import torch
+
+        content = io.BytesIO()
+        figures = None if stats is None else asdict(stats)
+        torch.save({"policy": policy.state_dict(), "stats": figures}, content)
+        temporary = self.weights.with_suffix(".tmp")
+        temporary.write_bytes(content.getbuffer())
+        temporary.replace(self.weights)
+
+
+@dataclass
+class LiveJob:
+    """What the view's process is to show."""
+
+    task: str
+    """Name of the task."""
+    env: Any
+    """Config of the environment."""
+    agent: Any
+    """Config of the learner."""
+    runner_cls: Any
+    """Class of the runner, which builds the policy's network."""
+    port: int
+    """Port of the page."""
+
+
+class LiveView(TrainingObserver):
+    """Runs the view's process and keeps it supplied. Whatever happens to it, training goes on."""
+
+    def __init__(self, task: str, cfg: TrainConfig, runner: MjlabOnPolicyRunner) -> None:
+        """Start the process.
+
+        Args:
+            task: Name of the task.
+            cfg: The run's configuration; it is left as it is.
+            runner: The runner whose policy is shown.
+
+        Raises:
+            UserError: the configuration cannot be handed to another process.
+        """
+        self._runner = runner
+        job = _pickled(LiveJob(task, _env_to_show(cfg), cfg.agent, type(runner), cfg.live_port))
+        self._folder = tempfile.TemporaryDirectory(prefix="mjlab-live-")
+        self._exchange = Exchange(Path(self._folder.name))
+        self._next_weights = 0.0
+        self._process: subprocess.Popen | None = _start(self._exchange)
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(len(job).to_bytes(8, "little") + job)
+            self._process.stdin.flush()
+        except OSError:
+            self._give_up_if_ended()
+
+    def on_start(self, first_iteration: int, total_iterations: int) -> None:
+        """Say where the page is; leave the weights that training starts from."""
+        self._exchange.write_weights(self._runner.alg.get_policy(), None)
+        limit = time.perf_counter() + _SECONDS_TO_START
+        while time.perf_counter() < limit and not self._give_up_if_ended():
+            if self._exchange.url.exists():
+                url = self._exchange.url.read_text()
+                print(f"Live:    {url} (open it in a browser)", flush=True)
+                return
+            time.sleep(0.02)
+
+    def on_iteration(self, stats: IterationStats) -> None:
+        """Leave the newest weights, if anyone is watching."""
+        begin = time.perf_counter()
+        if begin < self._next_weights or self._give_up_if_ended():
+            return
+        if not self._exchange.watched.exists():
+            return
+        try:
+            self._exchange.write_weights(self._runner.alg.get_policy(), stats)
+        except OSError as error:
+            logger.warning("The live view gets no new weights: %s", error)
+        end = time.perf_counter()
+        self._next_weights = end + max(_SECONDS_BETWEEN_WEIGHTS, (end - begin) / _LARGEST_SHARE)
+
+    def on_end(self, reason: str) -> None:
+        """End the process."""
+        process, self._process = self._process, None
+        if process is not None:
+            _end(process)
+        self._folder.cleanup()
+
+    def _give_up_if_ended(self) -> bool:
+        """Return whether there is no process; say so when it is first noticed."""
+        if self._process is None:
+            return True
+        if self._process.poll() is None:
+            return False
+        self._process = None
+        reason = (self._exchange.log.read_text(errors="replace").strip().splitlines() or [""])[-1]
+        logger.warning("The live view has ended; training goes on. %s", reason)
+        return True
+
+
+def _env_to_show(cfg: TrainConfig) -> Any:
+    """Return the run's environment as it is shown: few of it, on one thread, writing no files."""
+    env = copy.deepcopy(cfg.env)
+    env.scene.num_envs = min(_NUM_ENVS, env.scene.num_envs)
+    env.sim.engine = "native"
+    env.sim.num_threads = 1
+    env.sim.nan_guard.enabled = False
+    env.recorders = {}
+    return env
+
+
+def _pickled(job: LiveJob) -> bytes:
+    try:
+        return pickle.dumps(job)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise UserError(
+            "--live cannot hand this task to another process, because something in its config "
+            f"cannot be pickled: {error}. Use functions and classes of modules there, and no "
+            "lambdas; or train without --live."
+        ) from error
+
+
+def _start(exchange: Exchange) -> subprocess.Popen:
+    environment = {k: v for k, v in os.environ.items() if k not in _DISTRIBUTED}
+    # The GPU is the training's, and so are all threads but one.
+    environment |= {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1", "MJLAB_TORCH_THREADS": "1"}
+    with open(exchange.log, "wb") as log:
+        return subprocess.Popen(
+            [sys.executable, "-m", "mjlab.scripts.live_view", str(exchange.folder)],
+            stdin=subprocess.PIPE,
+            stdout=log,
+            stderr=log,
+            env=environment,
+            # Ctrl-C is for training, which ends the view. A session of its own would do that too,
+            # but Linux shares processors out by session first, and by priority only within one.
+            process_group=0 if os.name == "posix" else None,
+        )
+
+
+def _end(process: subprocess.Popen) -> None:
+    """Let the process end by closing its standard input; kill it if it does not."""
+    assert process.stdin is not None
+    try:
+        process.stdin.close()
+    except OSError:
+        pass
+    try:
+        process.wait(_SECONDS_TO_END)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

@@ -1,0 +1,142 @@
+"""The process behind `train --live`: the page of the policy that another process trains.
+
+It is started by `mjlab.scripts.live`, reads what to show from its standard input, and ends when
+that is closed, however the other process came to its end. It runs at the lowest priority, and
+builds and steps its environment only while a browser is connected.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import viser
+
+    from mjlab.scripts.live import Exchange, LiveJob
+
+_WAITING = 0.25
+
+
+def main() -> None:
+    """Show what standard input says, in the folder of the exchange that is the only argument."""
+    lower_priority()
+    # Training decides what Ctrl-C means.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    size = int.from_bytes(sys.stdin.buffer.read(8), "little")
+    pickled = sys.stdin.buffer.read(size)
+    if size == 0 or len(pickled) < size:
+        return
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    # Imports everything that the task needs; from here on the process is that of a training run,
+    # and the bytes come from the process that started it.
+    from mjlab.scripts.live import Exchange
+
+    show(pickle.loads(pickled), Exchange(Path(sys.argv[1])))
+
+
+def lower_priority() -> None:
+    """Take only processor time that nothing else wants, as far as the system can do that."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.nice(19)
+    if hasattr(os, "SCHED_IDLE"):
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+
+
+def show(job: LiveJob, exchange: Exchange) -> None:
+    """Serve the page; build what it shows when the first browser connects."""
+    import viser
+
+    server = viser.ViserServer(host="127.0.0.1", port=job.port, verbose=False)
+    temporary = exchange.url.with_suffix(".tmp")
+    temporary.write_text(f"http://localhost:{server.get_port()}")
+    temporary.replace(exchange.url)
+    note = server.gui.add_markdown("Preparing the view …")
+    while not server.get_clients():
+        time.sleep(_WAITING)
+    exchange.watched.touch()
+    viewer = _make_viewer(job, exchange, server)
+    note.remove()
+    viewer.run(catch_sigint=False)
+
+
+def _make_viewer(job: LiveJob, exchange: Exchange, server: viser.ViserServer) -> Any:
+    import torch
+
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.rl import RslRlVecEnvWrapper
+    from mjlab.viewer.viser.live import LiveViewer
+
+    torch.set_num_threads(1)
+    env = ManagerBasedRlEnv(job.env, device="cpu")
+    wrapped = RslRlVecEnvWrapper(env, clip_actions=job.agent.clip_actions)
+    runner = job.runner_cls(wrapped, asdict(job.agent), None, "cpu")
+    network = runner.alg.get_policy()
+    weights = NewestWeights(exchange, network, env)
+    weights.take()
+    return LiveViewer(
+        wrapped,
+        runner.get_inference_policy(device="cpu"),
+        title=job.task,
+        take_stats=weights.take,
+        set_watched=lambda watched: _set_watched(exchange, watched),
+        viser_server=server,
+    )
+
+
+def _set_watched(exchange: Exchange, watched: bool) -> None:
+    if watched:
+        exchange.watched.touch()
+    else:
+        exchange.watched.unlink(missing_ok=True)
+
+
+class NewestWeights:
+    """Loads the weights that training leaves into a network."""
+
+    def __init__(self, exchange: Exchange, network: Any, env: Any) -> None:
+        self._path = exchange.weights
+        self._network = network
+        self._env = env
+        self._seen: tuple[int, int] | None = None
+
+    def take(self) -> dict[str, Any] | None:
+        """Load the newest weights; return the figures of their iteration, or None if not new."""
+        import torch
+
+        try:
+            status = self._path.stat()
+            mark = (status.st_mtime_ns, status.st_ino)
+            if mark == self._seen:
+                return None
+            content = torch.load(self._path, map_location="cpu", weights_only=True)
+        except FileNotFoundError:
+            return None
+        self._seen = mark
+        self._network.load_state_dict(content["policy"])
+        stats = content["stats"]
+        if stats is not None:
+            # What a curriculum has got to by now.
+            steps = stats["iteration"] * self._num_steps_per_iteration(stats)
+            self._env.common_step_counter = max(self._env.common_step_counter, steps)
+        return stats
+
+
+def _end_with_parent() -> None:
+    """End this process when its standard input is closed, whatever it is doing."""
+    with contextlib.suppress(OSError):
+        sys.stdin.buffer.read()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,298 @@
+"""What rays meet, on both engines, and that looking only at what is near changes nothing."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mjlab.sim import Simulation, SimulationCfg
+
+ENGINES = ("native", "warp")
+DOWN, UP = (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)
+
+SHAPES = """
+<mujoco>
+  <asset>
+    <mesh name="cube" vertex="-1 -1 -1 1 -1 -1 -1 1 -1 1 1 -1 -1 -1 1 1 -1 1 -1 1 1 1 1 1"/>
+    <hfield name="hill" nrow="5" ncol="5" size="2 2 1 .5"
+      elevation="0 0 0 0 0  0 1 1 1 0  0 1 1 1 0  0 1 1 1 0  0 0 0 0 0"/>
+    <material name="glass" rgba="1 1 1 0"/>
+    <material name="steel" rgba="1 1 1 1"/>
+  </asset>
+  <worldbody>
+    <geom name="plane" type="plane" size="1 1 .1"/>
+    <geom name="box" type="box" size="1 1 1" pos="10 0 0"/>
+    <geom name="sphere" type="sphere" size="1" pos="20 0 0"/>
+    <geom name="capsule" type="capsule" size="1 1" pos="30 0 0"/>
+    <geom name="cylinder" type="cylinder" size="1 1" pos="40 0 0"/>
+    <geom name="ellipsoid" type="ellipsoid" size="1 1 1.5" pos="50 0 0"/>
+    <geom name="mesh" type="mesh" mesh="cube" pos="60 0 0"/>
+    <geom name="hill" type="hfield" hfield="hill" pos="70 0 0"/>
+    <geom name="clear" type="box" size="1 1 1" pos="80 0 0" rgba="1 1 1 0"/>
+    <geom name="glazed" type="box" size="1 1 1" pos="90 0 0" material="glass"/>
+    <geom name="plated" type="box" size="1 1 1" pos="100 0 0" rgba="1 1 1 0" material="steel"/>
+    <geom name="far" type="box" size="1 1 1" pos="110 0 0" group="9"/>
+    <body name="ball" pos="0 50 0"><freejoint/><geom size=".1"/></body>
+  </worldbody>
+</mujoco>
+"""
+# Place along x, start height, direction; distance and normal's z, or None for a miss.
+CASES = {
+    "a plane from above": (0, 2.0, DOWN, 2.0, 1.0),
+    "a plane from below": (0, -2.0, UP, None, 0.0),
+    "beyond a plane's edge": (1.5, 2.0, DOWN, None, 0.0),
+    "a box from outside": (10, 3.0, DOWN, 2.0, 1.0),
+    "a box from inside": (10, 0.5, DOWN, 1.5, -1.0),
+    "a sphere from inside": (20, 0.5, DOWN, 1.5, -1.0),
+    "a capsule from inside": (30, 0.5, DOWN, 2.5, -1.0),
+    "a cylinder from inside": (40, 0.5, UP, 0.5, 1.0),
+    "an ellipsoid from inside": (50, 0.0, UP, 1.5, 1.0),
+    "a mesh from above": (60, 3.0, DOWN, 2.0, 1.0),
+    "a mesh from below": (60, -3.0, UP, 2.0, -1.0),
+    "a mesh from inside": (60, 0.5, DOWN, None, 0.0),
+    "a mesh from inside, sideways": (60, 0.5, (0.6, 0.0, 0.8), None, 0.0),
+    "a height field from above": (70, 3.0, DOWN, 2.0, 1.0),
+    "a height field from inside, down to its base": (70, 0.5, DOWN, None, 0.0),
+    "a height field from inside, up to its surface": (70, 0.5, UP, None, 0.0),
+    "a height field from inside its base": (70, -0.2, UP, None, 0.0),
+    "a height field from inside its base, down": (70, -0.2, DOWN, None, 0.0),
+    "a height field from below": (70, -3.0, UP, None, 0.0),
+    "the side of a height field's base": (73, -0.2, (-1.0, 0.0, 0.0), None, 0.0),
+    "the slope of a height field": (73, 0.25, (-1.0, 0.0, 0.0), 1.25, 0.70710678),
+    "out through the slope of a height field": (70, 0.5, (1.0, 0.0, 0.0), None, 0.0),
+    "a transparent geom": (80, 3.0, DOWN, None, 0.0),
+    "a geom of transparent material": (90, 3.0, DOWN, None, 0.0),
+    "a transparent geom of opaque material": (100, 3.0, DOWN, 2.0, 1.0),
+    "a geom of a group beyond 5": (110, 3.0, DOWN, 2.0, 1.0),
+}
+
+
+@pytest.fixture(scope="module", params=ENGINES)
+def shapes(request):
+    model = mujoco.MjModel.from_xml_string(SHAPES)
+    return Simulation(2, SimulationCfg(engine=request.param), model=model, device="cpu")
+
+
+def rays(*pairs) -> tuple[torch.Tensor, torch.Tensor]:
+    """Start and direction of each ray, in both environments."""
+    starts, directions = zip(*pairs, strict=True)
+    return (
+        torch.tensor(starts, dtype=torch.float32).repeat(2, 1, 1),
+        torch.tensor(directions, dtype=torch.float32).repeat(2, 1, 1),
+    )
+
+
+def test_surfaces_are_met_from_the_sides_from_which_they_are_there(shapes):
+    origins, directions = rays(
+        *[((x + 0.01, 0.02, z), direction) for x, z, direction, _, _ in CASES.values()]
+    )
+    reach = torch.full((len(CASES),), 5.0)
+    distances, normals, geoms = shapes.raycast(origins, directions, None, None, reach)
+    for i, (name, (_, _, _, expected, up)) in enumerate(CASES.items()):
+        distance = distances[1, i].item()
+        # The offset from the middle matters on round and on sloping surfaces.
+        assert distance == pytest.approx(-1.0 if expected is None else expected, abs=0.02), name
+        assert normals[1, i, 2].item() == pytest.approx(up, abs=1e-3), name
+        assert (geoms[1, i] < 0) == (expected is None), name
+        assert normals[1, i].norm().item() == pytest.approx(float(expected is not None)), name
+
+
+def test_flat_ground_of_a_height_field_is_not_taken_for_its_base(shapes):
+    origins, directions = rays(((71.99, 1.99, 3.0), DOWN), ((71.99, 1.99, 0.01), DOWN))
+    distances, normals, _ = shapes.raycast(origins, directions)
+    torch.testing.assert_close(distances[0], torch.tensor([2.99, 0.0]), atol=0.02, rtol=0)
+    assert (normals[0, :, 2] > 0.5).all()
+
+
+def test_what_lies_behind_a_surface_that_is_not_there_is_met():
+    # Inside the mesh there is a ball, and below the height field a floor.
+    xml = SHAPES.replace(
+        "<body name=",
+        '<geom size=".1" pos="60 0 -.5"/><geom type="plane" size="99 9 1" '
+        'pos="70 0 -4"/><body name=',
+    )
+    for engine in ENGINES:
+        model = mujoco.MjModel.from_xml_string(xml)
+        sim = Simulation(2, SimulationCfg(engine=engine), model=model, device="cpu")
+        origins, directions = rays(
+            *[((60.0, 0.0, 0.5), DOWN), ((60.3, 0.2, 0.5), DOWN)],
+            *[((70.1, 0.1, 0.5), DOWN), ((70.1, 0.1, 3.0), DOWN)],
+        )
+        distances, normals, _ = sim.raycast(origins, directions)
+        expected = torch.tensor([0.9, 4.5, 4.5, 2.0]).repeat(2, 1)
+        torch.testing.assert_close(distances, expected, atol=1e-4, rtol=0)
+        torch.testing.assert_close(normals[..., 2], torch.ones(2, 4))
+
+
+def test_groups_beyond_the_range_count_as_the_nearest(shapes):
+    origins, directions = rays(((110.0, 0.0, 3.0), DOWN), ((10.0, 0.0, 3.0), DOWN))
+    for groups, expected in (((5,), [2.0, -1.0]), ((0,), [-1.0, 2.0]), ((3,), [-1.0, -1.0])):
+        distances, _, geoms = shapes.raycast(origins, directions, groups)
+        assert distances[0].tolist() == pytest.approx(expected)
+        assert (geoms[0] >= 0).tolist() == [d > 0 for d in expected]
+
+
+def test_a_reach_and_an_excluded_body_are_each_rays_own(shapes):
+    above = ((0.0, 50.0, 1.0), DOWN)
+    origins, directions = rays(above, above, above, above)
+    ball = shapes.mj_model.body("ball").id
+    excluded = torch.tensor([-1, ball, -1, -1], dtype=torch.int32)
+    reach = torch.tensor([5.0, 5.0, 0.89, 0.91])
+    distances, normals, geoms = shapes.raycast(origins, directions, None, excluded, reach)
+    assert distances[1].tolist() == pytest.approx([0.9, -1.0, -1.0, 0.9], abs=1e-5)
+    assert geoms[1].tolist()[1:3] == [-1, -1] and (normals[1, 1:3] == 0).all()
+
+
+def test_both_engines_meet_the_same_on_any_ray():
+    generator = torch.Generator().manual_seed(0)
+    origins = torch.randn(2, 3000, 3, generator=generator)
+    origins[..., 0] += 10 * torch.randint(0, 12, (3000,), generator=generator)
+    directions = torch.nn.functional.normalize(torch.randn(2, 3000, 3, generator=generator), dim=-1)
+    results = []
+    for engine in ENGINES:
+        model = mujoco.MjModel.from_xml_string(SHAPES)
+        sim = Simulation(2, SimulationCfg(engine=engine), model=model, device="cpu")
+        results.append(sim.raycast(origins, directions))
+    (native, native_normals, _), (warp, warp_normals, _) = results
+    apart = (native - warp).abs() > 1e-3
+    # A ray along an edge may pass on either side of it.
+    assert apart.float().mean() < 2e-3
+    assert (native >= 0).float().mean() > 0.2
+    close = ~apart & ((native_normals - warp_normals).abs().amax(-1) < 2e-2)
+    assert close.float().mean() > 0.995
+
+
+# Only what is near.
+
+
+def terrain_model(turned: bool, moving: bool, hills: bool) -> mujoco.MjModel:
+    """Steps, balls and hills in rows, with something that moves above them."""
+    rng = np.random.default_rng(0)
+    spec = mujoco.MjSpec()
+    kinds = [mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER]
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, -0.4])
+    for i in range(12):
+        for j in range(12):
+            geom = spec.worldbody.add_geom(
+                type=kinds[rng.integers(2)],
+                size=[0.25, 0.25, 0.3],
+                pos=[0.5 * i - 3, 0.5 * j - 3, 0.2 * rng.random()],
+            )
+            if turned:
+                geom.alt.euler = list(rng.uniform(-20, 20, 3))
+    if hills:
+        for k in range(2):
+            heights = rng.random(400).astype(np.float32)
+            spec.add_hfield(name=f"h{k}", nrow=20, ncol=20, size=[1, 1, 0.4, 0.2], userdata=heights)
+            spec.worldbody.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=f"h{k}", pos=[4.0 + 2 * k, 0, 0]
+            )
+    body = spec.worldbody.add_body(name="body", pos=[0, 0, 1])
+    body.add_freejoint()
+    body.add_geom(size=[0.05, 0.05, 0.05], group=0 if moving else 2)
+    return spec.compile()
+
+
+def mj_ray(model, data, origin, direction, groups, exclude) -> tuple[float, np.ndarray]:
+    normal, geom = np.zeros(3), np.array([-1], dtype=np.int32)
+    mask = None if groups is None else np.isin(np.arange(6), groups).astype(np.uint8)
+    distance = mujoco.mj_ray(
+        model, data, origin.astype(float), direction.astype(float), mask, 1, exclude, geom, normal
+    )
+    return distance, normal
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("moving", [False, True])
+def test_rays_against_what_is_near_are_those_of_mj_ray_against_everything(turned, moving):
+    model = terrain_model(turned, moving, hills=False)
+    data = mujoco.MjData(model)
+    num_envs, groups = 4, (0,)
+    sim = Simulation(num_envs, SimulationCfg(engine="native"), model=model, device="cpu")
+    generator = torch.Generator().manual_seed(1)
+    grid = torch.stack(torch.meshgrid(torch.arange(8.0), torch.arange(9.0), indexing="ij"), -1)
+    grid = torch.cat((grid.flatten(0, 1) * 0.1 - 0.4, torch.full((72, 1), 0.9)), dim=-1)
+    tilted = torch.nn.functional.normalize(torch.randn(72, 3, generator=generator), dim=-1)
+    tilted[..., 2] = -3.0
+    tilted = torch.nn.functional.normalize(tilted, dim=-1)
+    reach = torch.full((72,), 1.5)
+    used = 0
+    for step in range(5):
+        centre = torch.rand(num_envs, 1, 3, generator=generator) * 8 - 4
+        centre[..., 2] = 0.0
+        centre[0] += 30.0 * (step == 3)
+        sim.data.qpos[:, :3] = centre[:, 0] + torch.tensor([0.02, 0.03, 0.8])
+        origins = (grid + centre).contiguous()
+        directions = torch.tensor(DOWN) if step < 3 else tilted
+        directions = directions.expand(num_envs, 72, 3).contiguous()
+        distances, normals, geoms = sim.raycast(origins, directions, groups, None, reach)
+        used += sum(len(p.parts) > 0 for p in sim._engine._rays._plans.values())
+        for env in range(num_envs):
+            data.qpos[:3] = sim.data.qpos[env, :3].numpy()
+            mujoco.mj_kinematics(model, data)
+            for r in range(0, 72, 7):
+                expected, normal = mj_ray(
+                    model, data, origins[env, r].numpy(), directions[env, r].numpy(), groups, -1
+                )
+                miss = expected > 1.5 or expected < 0
+                assert distances[env, r].item() == pytest.approx(-1 if miss else expected, abs=1e-6)
+                assert (geoms[env, r] < 0).item() == miss
+                if not miss:
+                    np.testing.assert_allclose(normals[env, r], normal, atol=1e-6)
+    # All looked only at what is near, but the first and the one in which the rays were tilted.
+    assert used == 3
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    x=st.floats(-5, 8), y=st.floats(-4, 4), z=st.floats(-0.3, 1.2), tilt=st.floats(-0.5, 0.5),
+    spread=st.sampled_from([0.02, 0.3, 2.0]),
+)  # fmt: skip
+def test_what_is_near_does_not_change_hills_wherever_the_rays_are(hilly, x, y, z, tilt, spread):
+    sim, everything = hilly
+    grid = torch.linspace(-1, 1, 40)[:, None] * torch.tensor([1.0, 0.7, 0.0]) * spread
+    origins = (grid + torch.tensor([x, y, z])).repeat(2, 1, 1)
+    origins[1] += 0.3
+    direction = torch.nn.functional.normalize(torch.tensor([tilt, 0.1 * tilt, -1.0]), dim=0)
+    directions = direction.expand(2, 40, 3).contiguous()
+    reach = torch.full((40,), 2.0)
+    every = everything.raycast(origins, directions, None, None, reach)
+    # The first call may find rays outside of the windows made before, the second does not.
+    for _ in range(2):
+        near = sim.raycast(origins, directions, None, None, reach)
+        for a, b in zip(near, every, strict=True):
+            torch.testing.assert_close(a, b, atol=1e-6, rtol=0)
+    assert all(p.parts for p in sim._engine._rays._plans.values())
+
+
+@pytest.fixture(scope="module")
+def hilly():
+    """A simulation that looks at what is near, and one that looks at everything."""
+    model = terrain_model(turned=False, moving=True, hills=True)
+    sims = [
+        Simulation(2, SimulationCfg(engine="native"), model=model, device="cpu") for _ in range(2)
+    ]
+    # Geoms that differ between environments are not sought by place.
+    sims[1].expand_model_fields(("geom_pos",))
+    points = torch.zeros(2, 40, 3)
+    points[..., 2] = 2.0
+    for _ in range(2):
+        sims[0].raycast(points, torch.tensor(DOWN).repeat(2, 40, 1), None, None, torch.ones(40))
+    return sims
+
+
+def test_geoms_that_a_randomization_has_moved_are_met_where_they_are():
+    model = terrain_model(turned=False, moving=False, hills=False)
+    sim = Simulation(3, SimulationCfg(engine="native"), model=model, device="cpu")
+    origins = torch.tensor([0.0, 0.0, 2.0]).repeat(3, 4, 1)
+    directions = torch.tensor(DOWN).repeat(3, 4, 1)
+    before = [sim.raycast(origins, directions)[0] for _ in range(3)][-1]
+    sim.expand_model_fields(("geom_pos",))
+    sim.model.geom_pos[1, :, 2] += 0.1
+    after = sim.raycast(origins, directions)[0]
+    moved = torch.tensor([0.0, -0.1, 0.0])[:, None]
+    torch.testing.assert_close(after, before + moved, atol=1e-5, rtol=0)

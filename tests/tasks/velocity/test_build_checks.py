@@ -1,0 +1,205 @@
+"""Mistakes in a config of the task: each is one clear message when the environment is built."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+from conftest import GO1_ROUGH
+
+from mjlab.sensor import BuiltinSensorCfg, ObjRef
+from mjlab.tasks.velocity.variants import get_sensor, remove_sensors
+
+
+def params_of(cfg, term):
+    return cfg.rewards[term].params
+
+
+@pytest.mark.parametrize(
+    ("term", "param", "message"),
+    [
+        ("foot_slip", "sensor_name", "'feet_ground_contct'. Did you mean 'feet_ground_contact'"),
+        ("foot_swing_height", "sensor_name", "no sensor 'feet_ground_contct'"),
+        ("soft_landing", "sensor_name", "no sensor 'feet_ground_contct'"),
+        ("air_time", "sensor_name", "no sensor 'feet_ground_contct'"),
+        ("angular_momentum", "sensor_name", "no sensor 'feet_ground_contct'"),
+        ("foot_clearance", "height_sensor_name", "no sensor 'feet_ground_contct'"),
+        ("track_linear_velocity", "command_name", "no command 'feet_ground_contct'"),
+        ("track_angular_velocity", "command_name", "no command"),
+        ("pose", "command_name", "no command"),
+        ("foot_slip", "command_name", "no command"),
+        ("foot_swing_height", "command_name", "no command"),
+        ("soft_landing", "command_name", "no command"),
+    ],
+)
+def test_a_sensor_or_command_that_does_not_exist_is_named_with_near_ones(
+    make_env, term, param, message
+):
+    def edit(cfg):
+        params_of(cfg, term)[param] = "feet_ground_contct"
+
+    with pytest.raises(ValueError, match=f"RewardManager term '{term}': .*{message}"):
+        make_env(edit=edit)
+
+
+@pytest.mark.parametrize(
+    ("group", "term"),
+    [("critic", "foot_height"), ("critic", "foot_air_time"), ("critic", "foot_contact")],
+)
+def test_a_sensor_that_observations_need_is_named_too(make_env, group, term):
+    def edit(cfg):
+        cfg.observations[group].terms[term].params["sensor_name"] = "foot_height_scn"
+
+    with pytest.raises(ValueError, match=f"'critic/{term}': .*no sensor 'foot_height_scn'. Did you"):
+        make_env(edit=edit)
+
+
+def test_a_sensor_of_another_kind_is_refused_with_those_of_the_right_one(make_env):
+    def edit(cfg):
+        params_of(cfg, "foot_slip")["sensor_name"] = "foot_height_scan"
+
+    message = "is a TerrainHeightSensor, and a ContactSensor is needed.*feet_ground_contact"
+    with pytest.raises(TypeError, match=message):
+        make_env(edit=edit)
+
+
+def test_a_termination_without_its_sensor_is_refused(make_env):
+    def edit(cfg):
+        remove_sensors(cfg, "thigh_ground_touch")
+
+    with pytest.raises(ValueError, match="'illegal_contact': .*no sensor 'thigh_ground_touch'"):
+        make_env(GO1_ROUGH, edit=edit)
+
+
+@pytest.mark.parametrize(
+    ("term", "other"),
+    [
+        ("foot_clearance", "the selection of sites"),
+        ("foot_swing_height", "the height sensor 'foot_height_scan'"),
+    ],
+)
+def test_feet_in_another_order_are_refused(make_env, term, other):
+    def edit(cfg):
+        scan = get_sensor(cfg, "foot_height_scan")
+        scan.frame = tuple(reversed(scan.frame))
+        cfg.rewards = {term: cfg.rewards[term]}
+
+    with pytest.raises(ValueError, match=f"'{term}': .*{other} has.*same feet in the same order"):
+        make_env(edit=edit)
+
+
+def test_sites_that_are_not_the_feet_in_contact_are_refused(make_env):
+    def edit(cfg):
+        asset_cfg = params_of(cfg, "foot_slip")["asset_cfg"]
+        asset_cfg.site_names, asset_cfg.preserve_order = ("FL", "FR", "RR", "RL"), True
+
+    with pytest.raises(ValueError, match=r"'foot_slip': .*\['FL', 'FR', 'RR', 'RL'\].*same order"):
+        make_env(edit=edit)
+
+
+def test_a_foot_less_is_refused(make_env):
+    def edit(cfg):
+        params_of(cfg, "foot_slip")["asset_cfg"].site_names = ("FR", "FL", "RR")
+
+    with pytest.raises(ValueError, match="have to be the same feet"):
+        make_env(edit=edit)
+
+
+@pytest.mark.parametrize(
+    ("term", "changes", "message"),
+    [
+        ("foot_swing_height", {"track_air_time": False}, "does not track air time"),
+        ("foot_slip", {"num_slots": 2, "reduce": "maxforce"}, "has 2 slots for each foot"),
+        ("soft_landing", {"fields": ("found",)}, r"has no \['force'\]"),
+        ("foot_slip", {"fields": ("force",), "track_air_time": False}, r"has no \['found'\]"),
+    ],
+)
+def test_a_contact_sensor_that_does_not_measure_what_is_needed_is_refused(
+    make_env, term, changes, message
+):
+    def edit(cfg):
+        cfg.scene.sensors = tuple(
+            dataclasses.replace(s, **changes) if s.name == "feet_ground_contact" else s
+            for s in cfg.scene.sensors
+        )
+        cfg.rewards = {term: cfg.rewards[term]}
+        del cfg.observations["critic"]
+
+    with pytest.raises(ValueError, match=f"'{term}': .*{message}"):
+        make_env(edit=edit)
+
+
+@pytest.mark.parametrize(
+    ("term", "changes", "message"),
+    [
+        ("foot_air_time", {"track_air_time": False}, "does not track air time"),
+        ("foot_contact", {"fields": ("force",), "track_air_time": False}, r"has no \['found'\]"),
+        ("foot_contact_forces", {"fields": ("found",)}, r"has no \['force'\]"),
+        ("foot_height", {"reduction": "none"}, "reduction='none', one height for each ray"),
+    ],
+)
+def test_a_sensor_that_does_not_measure_what_is_observed_is_refused(
+    make_env, term, changes, message
+):
+    def edit(cfg):
+        terms = cfg.observations["critic"].terms
+        name = terms[term].params["sensor_name"]
+        cfg.observations["critic"].terms = {term: terms[term]}
+        cfg.scene.sensors = tuple(
+            dataclasses.replace(s, **changes) if s.name == name else s for s in cfg.scene.sensors
+        )
+
+    with pytest.raises(ValueError, match=f"'critic/{term}': .*{message}"):
+        make_env(edit=edit)
+
+
+def test_heights_of_rays_are_no_heights_of_feet(make_env):
+    def edit(cfg):
+        get_sensor(cfg, "foot_height_scan").reduction = "none"
+        del cfg.observations["critic"]
+
+    with pytest.raises(ValueError, match="'foot_clearance': .*reduction='none'"):
+        make_env(edit=edit)
+
+
+@pytest.mark.parametrize(
+    ("term", "param", "value", "message"),
+    [
+        ("track_linear_velocity", "std", -0.5, "std is -0.5; it has to be positive"),
+        ("track_angular_velocity", "std", 0.0, "std is 0.0"),
+        ("foot_swing_height", "target_height", 0.0, "target_height is 0.0"),
+        ("air_time", "threshold_min", 0.5, "no air time is between them"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(make_env, term, param, value, message):
+    def edit(cfg):
+        params_of(cfg, term)[param] = value
+
+    with pytest.raises(ValueError, match=f"'{term}': .*{message}"):
+        make_env(edit=edit)
+
+
+def test_angular_momentum_has_three_components(make_env):
+    def edit(cfg):
+        trunk = ObjRef(type="body", name="trunk", entity="robot")
+        turned = BuiltinSensorCfg(name="turned", sensor_type="framequat", obj=trunk)
+        cfg.scene.sensors += (turned,)
+        params_of(cfg, "angular_momentum")["sensor_name"] = "robot/turned"
+
+    with pytest.raises(ValueError, match="'robot/turned' has 4 values; one of 3 is needed"):
+        make_env(edit=edit)
+
+
+def test_upright_needs_rays_of_a_sensor_that_exists(make_env):
+    def edit(cfg):
+        params_of(cfg, "upright")["terrain_sensor_names"] = ("terrain_scn",)
+
+    with pytest.raises(ValueError, match="'upright': .*'terrain_scn'. Did you mean 'terrain_scan'"):
+        make_env(GO1_ROUGH, edit=edit)
+
+
+def test_an_unknown_sensor_of_a_config_is_named_with_those_that_exist():
+    from conftest import task_cfg
+
+    with pytest.raises(KeyError, match=r"No sensor 'scan'; there are \['foot_height_scan'"):
+        get_sensor(task_cfg(), "scan")

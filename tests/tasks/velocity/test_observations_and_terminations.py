@@ -1,0 +1,123 @@
+"""Observations of feet, and terminations, against values known by hand."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from stand_ins import StandInEnv, contacts
+
+from mjlab.tasks.velocity import mdp
+
+# Observations.
+
+
+def test_feet_are_observed_as_their_sensors_measure_them():
+    scan = SimpleNamespace(data=SimpleNamespace(heights=torch.tensor([[0.1, 0.2]])))
+    found, air = torch.tensor([[0.0, 3.0]]), torch.tensor([[0.4, 0.0]])
+    env: Any = StandInEnv(1, scan=scan, feet=contacts(found=found, current_air_time=air))
+    assert torch.equal(mdp.foot_height(env, "scan"), scan.data.heights)
+    assert torch.equal(mdp.foot_air_time(env, "feet"), air)
+    assert mdp.foot_contact(env, "feet").tolist() == [[0.0, 1.0]]
+
+
+def test_contact_forces_are_observed_on_a_logarithmic_scale_foot_by_foot():
+    force = torch.tensor([[[0.0, math.e - 1, 1.0 - math.e], [100.0, -100.0, 0.0]]])
+    env: Any = StandInEnv(1, feet=contacts(force=force))
+    observed = mdp.foot_contact_forces(env, "feet")
+    log = math.log(101.0)
+    assert observed.tolist() == [pytest.approx([0.0, 1.0, -1.0, log, -log, 0.0])]
+
+
+# Contacts that end an episode.
+
+
+def test_any_strong_contact_in_the_last_substeps_is_illegal():
+    force = torch.zeros(3, 2, 4, 3)
+    force[0, 1, 3] = torch.tensor([0.0, 6.0, 8.1])
+    force[1, 0, 0] = torch.tensor([0.0, 6.0, 8.0])
+    env: Any = StandInEnv(3, touch=contacts(force_history=force))
+    assert mdp.illegal_contact(env, "touch").tolist() == [True, False, False]
+    assert mdp.illegal_contact(env, "touch", force_threshold=9.0).tolist() == [True, True, False]
+
+
+def test_without_a_history_any_contact_is_illegal():
+    env: Any = StandInEnv(touch=contacts(found=torch.tensor([[0.0, 1.0], [0.0, 0.0]])))
+    assert mdp.illegal_contact(env, "touch").tolist() == [True, False]
+
+
+# The edges of the terrain.
+
+
+def on_terrain(*positions: tuple[float, float], rows: int = 10, cols: int = 7, **cfg: Any) -> Any:
+    """Return an environment with robots at these places of a generated terrain."""
+    env: Any = StandInEnv(len(positions))
+    xy = torch.tensor(positions)
+    env.data.root_link_pos_w = torch.cat((xy, torch.zeros(len(xy), 1)), dim=1)
+    # What the config says is not what was built: a curriculum has a column for each kind.
+    generator = SimpleNamespace(**{"size": (8.0, 8.0), "border_width": 20.0, "num_cols": 20, **cfg})
+    env.scene.terrain = SimpleNamespace(
+        terrain_origins=torch.zeros(rows, cols, 3),
+        cfg=SimpleNamespace(terrain_generator=generator),
+    )
+    env.scene.env_origins = torch.zeros(len(xy), 3)
+    env.episode_length_buf = torch.full((len(xy),), 3)
+    return env
+
+
+def test_the_bounds_are_those_of_the_grid_that_was_built():
+    places = [(59.6, 47.6), (59.8, 0.0), (-59.8, 0.0), (0.0, 47.8), (0.0, -47.8)]
+    env = on_terrain(*places)
+    assert mdp.out_of_terrain_bounds(env).tolist() == [False, True, True, True, True]
+    # Cells need not be square, and the margin is the caller's.
+    grid = {"rows": 2, "cols": 3, "size": (8.0, 2.0), "border_width": 4.0}
+    env = on_terrain((9.9, 4.9), (10.1, 0.0), (0.0, 5.1), (0.0, 6.1), **grid)
+    assert mdp.out_of_terrain_bounds(env, margin=2.0).tolist() == [False, True, True, True]
+    assert mdp.out_of_terrain_bounds(env, margin=1.0).tolist() == [False, False, False, True]
+
+
+def test_a_wall_around_the_terrain_adds_no_ground_and_a_wide_margin_leaves_a_point():
+    env = on_terrain((3.6, 0.0), (3.8, 0.0), rows=1, cols=1, border_width=-5.0)
+    assert mdp.out_of_terrain_bounds(env).tolist() == [False, True]
+    assert mdp.out_of_terrain_bounds(env, margin=99.0).tolist() == [True, True]
+
+
+def test_the_edge_of_the_cell_is_a_share_of_half_its_size_away():
+    env = on_terrain((3.7, 0.0), (3.9, 0.0), (0.0, -3.9), (-5.9, 2.1))
+    env.scene.env_origins[3] = torch.tensor([-2.0, -1.0, 0.0])
+    assert mdp.terrain_edge_reached(env).tolist() == [False, True, True, True]
+    assert mdp.terrain_edge_reached(env, threshold_fraction=0.99).tolist()[:3] == [False] * 3
+    env.episode_length_buf[:] = torch.tensor([3, 3, 2, 1])
+    assert mdp.terrain_edge_reached(env).tolist() == [False, True, False, False]
+
+
+@pytest.mark.parametrize("term", [mdp.out_of_terrain_bounds, mdp.terrain_edge_reached])
+def test_a_plane_has_no_edge(term):
+    env = on_terrain((1e6, 1e6))
+    env.scene.terrain.terrain_origins = None
+    assert term(env).tolist() == [False]
+    env.scene.terrain = None
+    assert term(env).tolist() == [False]
+
+
+# Falling.
+
+
+@pytest.mark.parametrize("z", [-1.0, -1.0000002, 1.0000002])
+def test_the_angle_of_slightly_more_than_one_is_no_nan(z):
+    env: Any = StandInEnv(1)
+    env.data.projected_gravity_b = torch.tensor([[0.0, 0.0, z]])
+    # Upright has not fallen at any limit, and upside down has at every limit.
+    assert mdp.bad_orientation(env, limit_angle=0.0).tolist() == [z > 0]
+    assert mdp.bad_orientation(env, limit_angle=3.1).tolist() == [z > 0]
+
+
+def test_a_robot_has_fallen_beyond_the_limit_of_its_tilt():
+    env: Any = StandInEnv(2)
+    tilt = torch.tensor([1.21, 1.23])
+    zero = torch.zeros(2)
+    env.data.projected_gravity_b = torch.stack((torch.sin(tilt), zero, -torch.cos(tilt)), dim=1)
+    assert mdp.bad_orientation(env, limit_angle=math.radians(70.0)).tolist() == [False, True]
