@@ -177,9 +177,12 @@ def test_build_must_return_a_command(env):
         make(env, term=lambda cfg, env: object())
 
 
-def test_a_decreasing_time_range_is_refused(env):
-    with pytest.raises(ValueError, match="resampling_time_range"):
-        make(env, 2.0, 1.0)
+@pytest.mark.parametrize(
+    ("low", "high"), [(2.0, 1.0), (-1.0, 1.0), (-2.0, -1.0), (float("nan"), 1.0)]
+)
+def test_a_time_range_that_is_negative_or_turned_round_is_refused(env, low, high):
+    with pytest.raises(ValueError, match="resampling_time_range is .* must not be negative"):
+        make(env, low, high)
 
 
 class Box:

@@ -27,7 +27,8 @@ def test_the_height_scan_of_the_reference_has_17_by_11_rays_with_x_fastest():
     grid = offsets.unflatten(0, (11, 17))
     torch.testing.assert_close(grid[0, :, 0], torch.linspace(-0.8, 0.8, 17))
     torch.testing.assert_close(grid[:, 0, 1], torch.linspace(-0.5, 0.5, 11))
-    assert (grid[:, :, 0] == grid[:1, :, 0]).all() and (grid[:, :, 1] == grid[:, :1, 1]).all()
+    assert (grid[:, :, 0] == grid[:1, :, 0]).all()
+    assert (grid[:, :, 1] == grid[:, :1, 1]).all()
     assert (directions == torch.tensor([0.0, 0.0, -1.0])).all()
 
 
@@ -47,7 +48,7 @@ def test_a_grid_of_whole_steps_is_centred_and_reaches_both_ends_of_both_sides(co
 
 
 @pytest.mark.parametrize(
-    "size, expected",
+    ("size", "expected"),
     [
         (0.25, [-0.125, -0.025, 0.075]),
         (0.24, [-0.12, -0.02, 0.08]),
@@ -127,7 +128,7 @@ def test_an_intrinsic_matrix_gives_the_vertical_field_of_view():
 
 
 @pytest.mark.parametrize(
-    "pattern, message",
+    ("pattern", "message"),
     [
         (GridPatternCfg(resolution=0.0), "resolution is 0.0; it has to be positive"),
         (GridPatternCfg(resolution=-0.1), "resolution is -0.1"),

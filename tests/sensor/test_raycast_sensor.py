@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import typing
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -12,14 +13,25 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mjlab.entity import EntityCfg
+from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg, mdp
+from mjlab.envs.mdp import height_scan, time_out
+from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
+from mjlab.managers.event_manager import EventTermCfg
+from mjlab.managers.observation_manager import ObservationGroupCfg, ObservationTermCfg
+from mjlab.managers.reward_manager import RewardTermCfg
+from mjlab.managers.termination_manager import TerminationTermCfg
+from mjlab.scene import SceneCfg
 from mjlab.sensor import (
     GridPatternCfg,
     ObjRef,
     PinholeCameraPatternCfg,
+    RayCastSensor,
     RayCastSensorCfg,
     RingPatternCfg,
     TerrainHeightSensorCfg,
 )
+from mjlab.sim import MujocoCfg, SimulationCfg
 from mjlab.utils.lab_api.math import matrix_from_quat, quat_from_euler_xyz
 from mjlab.utils.state import capture_state, restore_state
 
@@ -102,7 +114,8 @@ def test_rays_beyond_their_reach_are_misses(engine):
     )
     sense(sim)
     near, far = scene["near"].data, scene["far"].data
-    assert (near.distances == -1.0).all() and (near.normals_w == 0.0).all()
+    assert (near.distances == -1.0).all()
+    assert (near.normals_w == 0.0).all()
     assert torch.equal(near.hit_pos_w[..., 2], torch.ones(1, 121))
     torch.testing.assert_close(far.distances, torch.ones(1, 121))
 
@@ -277,7 +290,8 @@ def test_data_is_zero_before_the_first_sense_and_then_that_of_the_last_one():
     sim, scene = scene_with(scan(pattern=ONE_RAY))
     sensor = scene["scan"]
     assert sensor.data.distances.tolist() == [[0.0]]
-    assert (sensor.data.hit_pos_w == 0).all() and sensor.data.frame_quat_w.isfinite().all()
+    assert (sensor.data.hit_pos_w == 0).all()
+    assert sensor.data.frame_quat_w.isfinite().all()
     sense(sim)
     assert sensor.data.distances.item() == pytest.approx(1.0)
     sim.data.qpos[0, 2] = 3.0
@@ -351,7 +365,7 @@ def test_an_environment_that_has_diverged_does_not_disturb_the_others():
 
 
 @pytest.mark.parametrize(
-    "kwargs, message",
+    ("kwargs", "message"),
     [
         ({"frame": ObjRef("body", "bas", "robot")}, "no body 'bas'. Close names: base"),
         ({"frame": ObjRef("site", "zzz", "robot")}, r"no site 'zzz'. It has: \['left', 'right'\]"),
@@ -424,3 +438,75 @@ def test_hits_rays_and_normals_are_drawn_for_the_environment_in_view():
         ("scan_normal_0", [0, 0, 0.2], 0.01, (1, 1, 1, 1)),
         ("scan_ray_1", [0, 0, -0.2], 0.01, (0, 0, 1, 1)),
     ]
+
+
+# In an environment.
+
+
+class Idle(ActionTerm):
+    action_dim = 1
+    raw_action = None
+
+    def process_actions(self, actions):
+        pass
+
+    def apply_actions(self):
+        pass
+
+
+@dataclass(kw_only=True)
+class IdleCfg(ActionTermCfg):
+    def build(self, env):
+        return Idle(self, env)
+
+
+def rise(env, env_ids):
+    """Put the robot one metre higher in every episode."""
+    env.sim.data.qpos[env_ids, 2] = 1.0 + env.common_step_counter
+
+
+def height_of_the_last_step(env):
+    return env.scene["scan"].data.distances[:, 0]
+
+
+def make_env(num_envs=2) -> ManagerBasedRlEnv:
+    robot = EntityCfg(spec_fn=lambda: mujoco.MjSpec.from_string(ROBOT))
+    sensors = (scan(pattern=GridPatternCfg(size=(0.2, 0.1)), max_distance=50.0),)
+    scan_term = ObservationTermCfg(func=height_scan, params={"sensor_name": "scan", "offset": 0.5})
+    cfg = ManagerBasedRlEnvCfg(
+        scene=SceneCfg(
+            num_envs=num_envs, entities={"robot": robot}, sensors=sensors, spec_fn=floor
+        ),
+        observations={"actor": ObservationGroupCfg(terms={"scan": scan_term})},
+        actions={"idle": IdleCfg(entity_name="robot")},
+        rewards={"seen": RewardTermCfg(func=height_of_the_last_step, weight=1.0)},
+        terminations={"end": TerminationTermCfg(func=time_out, time_out=True)},
+        events={"rise": EventTermCfg(func=rise, mode="reset")},
+        sim=SimulationCfg(mujoco=MujocoCfg(gravity=(0.0, 0.0, 0.0))),
+        decimation=2,
+        episode_length_s=0.012,
+        scale_rewards_by_dt=False,
+    )
+    return ManagerBasedRlEnv(cfg, device="cpu")
+
+
+def test_observations_see_the_current_scene_and_rewards_that_of_the_step_before():
+    env = make_env()
+    obs, _ = env.reset()
+    torch.testing.assert_close(obs["actor"], torch.full((2, 6), 0.5))
+    lengths = []
+    for step in range(1, 9):
+        before = env.sim.data.qpos[:, 2].clone()
+        obs, reward, _, truncated, _ = env.step(torch.zeros(2, 1))
+        # The reward is the height at the end of the step before.
+        torch.testing.assert_close(reward, before)
+        now = env.sim.data.qpos[:, 2]
+        torch.testing.assert_close(obs["actor"], (now - 0.5)[:, None].expand(2, 6))
+        lengths.append(bool(truncated[0]))
+        assert (now[0].item() == 1.0 + step) or not truncated[0]
+    assert any(lengths)
+    env.close()
+
+
+def test_the_ray_sensor_is_among_the_names_of_the_mdp_package():
+    assert mdp.RayCastSensor is RayCastSensor

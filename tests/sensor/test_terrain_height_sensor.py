@@ -10,7 +10,7 @@ import torch
 
 from mjlab.sensor import ObjRef, RingPatternCfg, TerrainHeightSensorCfg
 
-from .ray_scenes import BASE, ROBOT, floor, field_of, scene_with, sense
+from .ray_scenes import BASE, ROBOT, field_of, floor, scene_with, sense
 
 ENGINES = ("native", "warp")
 # Elevations 0.2 to 1 (of 1 m), rising along x.

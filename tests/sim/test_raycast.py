@@ -144,7 +144,8 @@ def test_a_reach_and_an_excluded_body_are_each_rays_own(shapes):
     reach = torch.tensor([5.0, 5.0, 0.89, 0.91])
     distances, normals, geoms = shapes.raycast(origins, directions, None, excluded, reach)
     assert distances[1].tolist() == pytest.approx([0.9, -1.0, -1.0, 0.9], abs=1e-5)
-    assert geoms[1].tolist()[1:3] == [-1, -1] and (normals[1, 1:3] == 0).all()
+    assert geoms[1].tolist()[1:3] == [-1, -1]
+    assert (normals[1, 1:3] == 0).all()
 
 
 def test_both_engines_meet_the_same_on_any_ray():

@@ -98,6 +98,11 @@ def test_a_field_that_no_sensor_feeds_is_refused():
         _ = make_sim().data.subtree_linvel
 
 
+def test_a_field_of_inverse_dynamics_is_refused_instead_of_reading_zero():
+    with pytest.raises(AttributeError, match=r"qfrc_inverse .* qfrc_actuator \+ qfrc_applied"):
+        _ = make_sim().data.qfrc_inverse
+
+
 def test_rotation_matrices_are_three_by_three():
     sim = make_sim()
     assert sim.data.xmat.shape == (4, sim.mj_model.nbody, 3, 3)
@@ -335,9 +340,23 @@ def test_unknown_fields_name_close_ones():
         sim.data.qpos = torch.zeros(4, 8)
 
 
-def test_a_field_the_engine_cannot_hold_per_environment_is_refused():
-    with pytest.raises(ValueError, match="geom_type"):
-        make_sim().expand_model_fields(("geom_type",))
+@pytest.mark.parametrize(
+    "field",
+    ["geom_type", "geom_contype", "geom_conaffinity", "body_contype", "dof_bodyid", "sensor_adr",
+     "body_geomnum", "actuator_trnid", "eq_active0", "geom_sameframe", "body_margin"],
+)  # fmt: skip
+def test_a_field_the_engine_cannot_hold_per_environment_is_refused(field):
+    sim = make_sim()
+    with pytest.raises(ValueError, match=f"'{field}'.* cannot differ between"):
+        sim.expand_model_fields((field,))
+    assert field not in sim.expanded_fields
+
+
+@pytest.mark.parametrize("field", ["geom_matid", "geom_condim", "jnt_limited"])
+def test_whole_numbers_that_nothing_was_compiled_from_may_differ(field):
+    sim = make_sim()
+    sim.expand_model_fields((field,))
+    assert getattr(sim.model, field).shape[0] == sim.num_envs
 
 
 def test_bad_requests_are_refused_when_the_simulation_is_built():

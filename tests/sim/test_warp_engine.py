@@ -119,6 +119,7 @@ def test_an_unknown_model_field_names_close_ones() -> None:
         ("nworld", "no per-environment MjData field"),
         ("cfrc_ext", "accelerometer, force"),
         ("subtree_angmom", "subtreeangmom"),
+        ("qfrc_inverse", "qfrc_actuator"),
     ],
 )
 def test_a_data_field_that_is_not_offered_says_why(field: str, said: str) -> None:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __getattr__ = older_names(__name__)
 
-_TRANSMISSIONS = {
+XML_TRANSMISSIONS = {
     TransmissionType.JOINT: (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT),
     TransmissionType.TENDON: (mujoco.mjtTrn.mjTRN_TENDON,),
     TransmissionType.SITE: (mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtTrn.mjTRN_SLIDERCRANK),
@@ -111,7 +111,7 @@ class XmlActuator(DirectActuator[XmlActuatorCfg]):
         """Return the first actuator of each target with this transmission."""
         found: dict[str, mujoco.MjsActuator] = {}
         for element in spec.actuators:
-            if element.trntype in _TRANSMISSIONS[self.transmission_type]:
+            if element.trntype in XML_TRANSMISSIONS[self.transmission_type]:
                 found.setdefault(element.target, element)
         return found
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from mjlab.actuator import TransmissionType, XmlActuatorCfg
+from mjlab.actuator.xml_actuator import XML_TRANSMISSIONS
 from mjlab.entity.initial_state import short_name
 
 if TYPE_CHECKING:
@@ -24,7 +25,8 @@ def build_actuators(entity: Entity) -> list[Actuator]:
     (joints, then tendons, then sites), after those that the XML already has.
 
     Raises:
-        ValueError: the patterns of a config do not resolve, with the reason and the candidates.
+        ValueError: the patterns of a config do not resolve, with the reason and the candidates; or
+            what they match has an actuator already, of another config or of the XML.
     """
     articulation = entity.cfg.articulation
     if articulation is None:
@@ -33,12 +35,48 @@ def build_actuators(entity: Entity) -> list[Actuator]:
     for cfg in articulation.actuators:
         ids, names = _find_targets(entity, cfg)
         built.append((cfg.build(entity, ids, names), ids))
+    _refuse_second_actuators(entity, built)
     if entity.cfg.sort_actuators:
         _add_sorted(entity, built)
     else:
-        for actuator, ids in built:
+        # Those that wrap the XML's actuators come first, before there are others to find. They
+        # add nothing.
+        for actuator, ids in sorted(built, key=lambda pair: not _wraps_xml(pair[0])):
             _add(entity, actuator, ids)
     return [actuator for actuator, _ in built]
+
+
+def _wraps_xml(actuator: Actuator) -> bool:
+    return isinstance(actuator.cfg, XmlActuatorCfg)
+
+
+def _refuse_second_actuators(entity: Entity, built: list[tuple[Actuator, list[int]]]) -> None:
+    """Raise if two would act on the same joint, tendon or site, adding up their forces."""
+    in_xml = {
+        (transmission, element.target): f"the actuator {element.name or '(unnamed)'!r} of the XML"
+        for element in entity.spec.actuators
+        for transmission, kinds in XML_TRANSMISSIONS.items()
+        if element.trntype in kinds
+    }
+    claimed: dict[tuple[TransmissionType, str], str] = {}
+    for actuator, ids in built:
+        cfg, kind = actuator.cfg, actuator.transmission_type
+        wraps = _wraps_xml(actuator)
+        keys = [(kind, _elements(entity, kind)[index].name) for index in ids]
+        # One that wraps those of the XML leaves out what has none.
+        keys = [key for key in keys if key in in_xml or not wraps]
+        taken = {key: claimed[key] for key in keys if key in claimed}
+        if not wraps:
+            taken |= {key: in_xml[key] for key in keys if key in in_xml}
+        if taken:
+            found = ", ".join(f"{short_name(name)!r} has {by}" for (_, name), by in taken.items())
+            raise ValueError(
+                f"{type(cfg).__name__}(target_names_expr={cfg.target_names_expr!r}) acts on "
+                f"{kind.value}s that have an actuator already: {found}. Give each one actuator: "
+                "narrow the patterns, remove the actuator from the XML, or use it as it is there, "
+                "by XmlActuatorCfg alone."
+            )
+        claimed |= dict.fromkeys(keys, f"one by {type(cfg).__name__}({cfg.target_names_expr!r})")
 
 
 def _add(entity: Entity, actuator: Actuator, ids: list[int]) -> None:
@@ -51,7 +89,7 @@ def _add(entity: Entity, actuator: Actuator, ids: list[int]) -> None:
 def _add_sorted(entity: Entity, built: list[tuple[Actuator, list[int]]]) -> None:
     pairs = []
     for position, (actuator, ids) in enumerate(built):
-        if isinstance(actuator.cfg, XmlActuatorCfg):
+        if _wraps_xml(actuator):
             _add(entity, actuator, ids)
         else:
             order = _ORDER[actuator.transmission_type]

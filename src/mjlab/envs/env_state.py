@@ -30,6 +30,7 @@ def state_dict(env: ManagerBasedRlEnv) -> dict[str, Any]:
     return {
         "num_envs": env.num_envs,
         "terms": _terms(env),
+        "terrain": _terrain_measures(env),
         "counters": {name: getattr(env, name) for name in _COUNTERS},
         "buffers": {name: getattr(env, name).clone() for name in _BUFFERS},
         "observations": _cloned(env.obs_buf),
@@ -72,7 +73,7 @@ def _check_fits(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
             f"The saved environment state is of the {state['sim']['engine']} engine; this run has "
             f"{env.sim.engine_name}. Resume with --engine {state['sim']['engine']}."
         )
-    _check_terrain(env, state["scene"])
+    _check_terrain(env, state.get("terrain"))
     current = state_dict(env)
     differences = [
         f"{manager} had the terms {state['terms'].get(manager)} and has {current['terms'].get(manager)}"
@@ -87,18 +88,32 @@ def _check_fits(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
         )
 
 
-def _check_terrain(env: ManagerBasedRlEnv, scene: dict[str, Any]) -> None:
+def _check_terrain(env: ManagerBasedRlEnv, saved: torch.Tensor | None) -> None:
     """Raise ValueError if the saved environments stood on another generated terrain."""
-    terrain = env.scene.terrain
-    saved = scene.get("_terrain", {}).get("terrain_origins")
-    if terrain is None or terrain.terrain_origins is None or saved is None:
+    here = _terrain_measures(env)
+    if saved is None or here is None:
         return
-    here = terrain.terrain_origins
-    if saved.shape != here.shape or not torch.equal(saved.to(here.device), here):
+    if saved.shape != here.shape or not torch.allclose(saved.cpu(), here, rtol=1e-6):
         raise ValueError(
             "The saved environments stand on another terrain than these. Terrain follows from the "
             "seed: resume with the seed and the terrain settings of the run that saved them."
         )
+
+
+def _terrain_measures(env: ManagerBasedRlEnv) -> torch.Tensor | None:
+    """Return numbers by which one generated terrain is told from another; None on a plane.
+
+    They are weighted sums over its geoms and height fields, which are part of the model.
+    """
+    terrain, model = env.scene.terrain, env.sim.mj_model
+    if terrain is None or terrain.terrain_origins is None:
+        return None
+    is_ground = model.geom_bodyid == model.body("terrain").id
+    parts = (model.geom_pos[is_ground], model.geom_size[is_ground], model.hfield_data)
+    flat = [torch.as_tensor(part.ravel(), dtype=torch.float64) for part in parts]
+    weights = [torch.linspace(1.0, 2.0, len(part), dtype=torch.float64) for part in flat]
+    sums = [part @ weight for part, weight in zip(flat, weights, strict=True)]
+    return torch.stack([*sums, *(torch.tensor(float(len(part))) for part in flat)])
 
 
 def _terms(env: ManagerBasedRlEnv) -> dict[str, Any]:

@@ -53,7 +53,7 @@ class CommandTerm(ManagerTermBase):
         metrics: Name to values (num_envs,); their means are logged at resets, then zeroed.
 
     Raises `TypeError` if `_update_command` takes no `env_ids`, and `ValueError` if the config's
-    time range is not increasing.
+    time range is negative or turned round.
     """
 
     def __init__(self, cfg: CommandTermCfg, env: ManagerBasedRlEnv) -> None:
@@ -177,10 +177,10 @@ class CommandTerm(ManagerTermBase):
                 "`def _update_command(self, env_ids: torch.Tensor | None) -> None`."
             )
         low, high = self.cfg.resampling_time_range
-        if low > high:
+        if not 0.0 <= low <= high:
             raise ValueError(
-                f"{self.name}: resampling_time_range is {(low, high)}, but the first number must "
-                "not be larger than the second."
+                f"{self.name}: resampling_time_range is {(low, high)}; these are times in seconds, "
+                "so they must not be negative, nor the first larger than the second."
             )
 
 

@@ -7,6 +7,7 @@ the other process (`mjlab.scripts.live_view`), which takes processor time that t
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import io
 import logging
@@ -55,13 +56,20 @@ class Exchange:
         self.log = folder / "log.txt"
         """What the view's process printed."""
 
-    def write_weights(self, policy: Any, stats: IterationStats | None) -> None:
-        """Leave a policy's state, and the figures of the iteration that it comes from."""
+    def write_weights(self, policy: Any, num_steps: int, stats: IterationStats | None) -> None:
+        """Leave a policy's state.
+
+        Args:
+            policy: The network.
+            num_steps: Steps that each environment has made, which curricula go by.
+            stats: Figures of the iteration that the policy comes from, if there was one.
+        """
         import torch
 
         content = io.BytesIO()
         figures = None if stats is None else asdict(stats)
-        torch.save({"policy": policy.state_dict(), "stats": figures}, content)
+        policy_state = policy.state_dict()
+        torch.save({"policy": policy_state, "num_steps": num_steps, "stats": figures}, content)
         temporary = self.weights.with_suffix(".tmp")
         temporary.write_bytes(content.getbuffer())
         temporary.replace(self.weights)
@@ -79,8 +87,6 @@ class LiveJob:
     """Config of the learner."""
     runner_cls: Any
     """Class of the runner, which builds the policy's network."""
-    port: int
-    """Port of the page."""
 
 
 class LiveView(TrainingObserver):
@@ -98,11 +104,11 @@ class LiveView(TrainingObserver):
             UserError: the configuration cannot be handed to another process.
         """
         self._runner = runner
-        job = _pickled(LiveJob(task, _env_to_show(cfg), cfg.agent, type(runner), cfg.live_port))
+        job = _pickled(LiveJob(task, _env_to_show(cfg), cfg.agent, type(runner)))
         self._folder = tempfile.TemporaryDirectory(prefix="mjlab-live-")
         self._exchange = Exchange(Path(self._folder.name))
         self._next_weights = 0.0
-        self._process: subprocess.Popen | None = _start(self._exchange)
+        self._process: subprocess.Popen | None = _start(self._exchange, cfg.live_port)
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(len(job).to_bytes(8, "little") + job)
@@ -112,7 +118,7 @@ class LiveView(TrainingObserver):
 
     def on_start(self, first_iteration: int, total_iterations: int) -> None:
         """Say where the page is; leave the weights that training starts from."""
-        self._exchange.write_weights(self._runner.alg.get_policy(), None)
+        self._write_weights(None)
         limit = time.perf_counter() + _SECONDS_TO_START
         while time.perf_counter() < limit and not self._give_up_if_ended():
             if self._exchange.url.exists():
@@ -129,7 +135,7 @@ class LiveView(TrainingObserver):
         if not self._exchange.watched.exists():
             return
         try:
-            self._exchange.write_weights(self._runner.alg.get_policy(), stats)
+            self._write_weights(stats)
         except OSError as error:
             logger.warning("The live view gets no new weights: %s", error)
         end = time.perf_counter()
@@ -141,6 +147,10 @@ class LiveView(TrainingObserver):
         if process is not None:
             _end(process)
         self._folder.cleanup()
+
+    def _write_weights(self, stats: IterationStats | None) -> None:
+        num_steps = int(getattr(self._runner.env.unwrapped, "common_step_counter", 0))
+        self._exchange.write_weights(self._runner.alg.get_policy(), num_steps, stats)
 
     def _give_up_if_ended(self) -> bool:
         """Return whether there is no process; say so when it is first noticed."""
@@ -166,23 +176,26 @@ def _env_to_show(cfg: TrainConfig) -> Any:
 
 
 def _pickled(job: LiveJob) -> bytes:
+    # Configs hold lambdas, and classes of the program that calls us, which only this pickles.
+    import cloudpickle
+
     try:
-        return pickle.dumps(job)
+        return cloudpickle.dumps(job)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise UserError(
             "--live cannot hand this task to another process, because something in its config "
-            f"cannot be pickled: {error}. Use functions and classes of modules there, and no "
-            "lambdas; or train without --live."
+            f"cannot be pickled: {error}. Build such things in functions that the config names, "
+            "or train without --live."
         ) from error
 
 
-def _start(exchange: Exchange) -> subprocess.Popen:
+def _start(exchange: Exchange, port: int) -> subprocess.Popen:
     environment = {k: v for k, v in os.environ.items() if k not in _DISTRIBUTED}
     # The GPU is the training's, and so are all threads but one.
     environment |= {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1", "MJLAB_TORCH_THREADS": "1"}
     with open(exchange.log, "wb") as log:
         return subprocess.Popen(
-            [sys.executable, "-m", "mjlab.scripts.live_view", str(exchange.folder)],
+            [sys.executable, "-m", "mjlab.scripts.live_view", str(exchange.folder), str(port)],
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=log,
@@ -196,10 +209,8 @@ def _start(exchange: Exchange) -> subprocess.Popen:
 def _end(process: subprocess.Popen) -> None:
     """Let the process end by closing its standard input; kill it if it does not."""
     assert process.stdin is not None
-    try:
+    with contextlib.suppress(OSError):
         process.stdin.close()
-    except OSError:
-        pass
     try:
         process.wait(_SECONDS_TO_END)
     except subprocess.TimeoutExpired:

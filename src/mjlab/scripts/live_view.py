@@ -27,7 +27,7 @@ _WAITING = 0.25
 
 
 def main() -> None:
-    """Show what standard input says, in the folder of the exchange that is the only argument."""
+    """Show what standard input says. The arguments are the folder of the exchange and the port."""
     lower_priority()
     # Training decides what Ctrl-C means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -36,11 +36,9 @@ def main() -> None:
     if size == 0 or len(pickled) < size:
         return
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    # Imports everything that the task needs; from here on the process is that of a training run,
-    # and the bytes come from the process that started it.
     from mjlab.scripts.live import Exchange
 
-    show(pickle.loads(pickled), Exchange(Path(sys.argv[1])))
+    show(pickled, Exchange(Path(sys.argv[1])), int(sys.argv[2]))
 
 
 def lower_priority() -> None:
@@ -52,11 +50,14 @@ def lower_priority() -> None:
             os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
 
 
-def show(job: LiveJob, exchange: Exchange) -> None:
-    """Serve the page; build what it shows when the first browser connects."""
+def show(pickled: bytes, exchange: Exchange, port: int) -> None:
+    """Serve the page of a pickled `LiveJob`; build what it shows when the first browser connects.
+
+    Until then, neither torch nor the task are imported.
+    """
     import viser
 
-    server = viser.ViserServer(host="127.0.0.1", port=job.port, verbose=False)
+    server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
     temporary = exchange.url.with_suffix(".tmp")
     temporary.write_text(f"http://localhost:{server.get_port()}")
     temporary.replace(exchange.url)
@@ -64,7 +65,7 @@ def show(job: LiveJob, exchange: Exchange) -> None:
     while not server.get_clients():
         time.sleep(_WAITING)
     exchange.watched.touch()
-    viewer = _make_viewer(job, exchange, server)
+    viewer = _make_viewer(pickle.loads(pickled), exchange, server)
     note.remove()
     viewer.run(catch_sigint=False)
 
@@ -123,12 +124,9 @@ class NewestWeights:
             return None
         self._seen = mark
         self._network.load_state_dict(content["policy"])
-        stats = content["stats"]
-        if stats is not None:
-            # What a curriculum has got to by now.
-            steps = stats["iteration"] * self._num_steps_per_iteration(stats)
-            self._env.common_step_counter = max(self._env.common_step_counter, steps)
-        return stats
+        # Curricula get to where they are in training.
+        self._env.common_step_counter = content["num_steps"]
+        return content["stats"]
 
 
 def _end_with_parent() -> None:

@@ -33,7 +33,7 @@ def __getattr__(name: str) -> Any:
 
 def _command(argv: list[str]) -> None:
     task, flags = task_and_flags(argv, _USAGE)
-    from mjlab.scripts.train_run import check_flags, launch_training, parse_train_flags
+    from mjlab.scripts.train_run import launch_training, parse_train_flags
     from mjlab.scripts.training_device import gpus_to_share
 
     cfg = parse_train_flags(task, flags, prog=f"train {task}")
@@ -42,6 +42,7 @@ def _command(argv: list[str]) -> None:
         launch_training(task, cfg)
         return
     from mjlab.scripts.launcher import launch_workers, train_command
+    from mjlab.scripts.train_checks import check_flags
 
     check_flags(cfg)
     # Of the GPUs that they see, the processes use all.

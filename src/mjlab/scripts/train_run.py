@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Literal
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import RslRlBaseRunnerCfg
 from mjlab.rl.progress import TrainingObserver
-from mjlab.scripts.cli import UserError
 from mjlab.scripts.process_output import ProcessOutput, log_file, output_of
 from mjlab.scripts.profiles import parse_with_profile, suggest_profile
 from mjlab.scripts.resume import (
@@ -23,6 +22,7 @@ from mjlab.scripts.resume import (
     profile_to_resume,
 )
 from mjlab.scripts.run_folder import NewRunFolder, SharedRunFolder, write_run_info
+from mjlab.scripts.train_checks import check_flags
 from mjlab.scripts.training_device import training_device
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 from mjlab.utils.processes import ProcessRank, cores_per_process, process_rank
@@ -31,10 +31,6 @@ if TYPE_CHECKING:
     from mjlab.rl import MjlabOnPolicyRunner
 
 logger = logging.getLogger(__name__)
-
-_AGENT_COUNTS = ("num_steps_per_env", "max_iterations", "save_interval")
-_ALGORITHM_COUNTS = ("num_learning_epochs", "num_mini_batches")
-_SEPARATORS = ("/", "\\")
 
 
 @dataclass
@@ -74,6 +70,10 @@ class TrainConfig:
     """With --agent.resume True: the Weights & Biases run to resume, as entity/project/run."""
     wandb_checkpoint_name: str | None = None
     """Checkpoint of that run; None takes the newest."""
+    live: bool = False
+    """Serve a page in the browser that shows the policy as it learns."""
+    live_port: int = 8080
+    """Port of that page; the next free one where it is taken."""
     gpu_ids: list[int] | Literal["all"] | None = field(default_factory=lambda: [0])
     """Indices of the GPUs to use where --device is not given, or `all`; with several, a process
     for each is started. None trains on the CPU."""
@@ -181,40 +181,6 @@ def _run_folder(
         yield new if rank.is_first else SharedRunFolder(path)
 
 
-def check_flags(cfg: TrainConfig) -> None:
-    """Raise UserError for what is wrong in the flags and can be told without building anything."""
-    _check_numbers(cfg)
-    _check_names(cfg)
-
-
-def _check_numbers(cfg: TrainConfig) -> None:
-    """Refuse counts that could only fail once training runs; the environment checks its own."""
-    agent: Any = cfg.agent
-    counts = {f"--agent.{name}": getattr(agent, name) for name in _AGENT_COUNTS}
-    for name in _ALGORITHM_COUNTS:
-        # Algorithms other than PPO may lack them.
-        counts[f"--agent.algorithm.{name}"] = getattr(getattr(agent, "algorithm", None), name, 1)
-    counts |= {"--video-length": cfg.video_length, "--video-interval": cfg.video_interval}
-    for flag, value in counts.items():
-        if value < 1:
-            raise UserError(f"{flag.replace('_', '-')} is {value}; it has to be at least 1.")
-
-
-def _check_names(cfg: TrainConfig) -> None:
-    """Refuse names that would put the run's folder elsewhere than below that of all runs."""
-    run_name, experiment = cfg.agent.run_name, cfg.agent.experiment_name
-    if any(separator in run_name for separator in _SEPARATORS):
-        raise UserError(
-            f"--agent.run-name is {run_name!r}; it is part of one folder's name and may not hold "
-            "a path separator. Runs are grouped by --agent.experiment-name."
-        )
-    if Path(experiment).is_absolute() or ".." in experiment.replace("\\", "/").split("/"):
-        raise UserError(
-            f"--agent.experiment-name is {experiment!r}; it names a folder within --log-root, so "
-            "it may be neither absolute nor contain '..'. Choose another place with --log-root."
-        )
-
-
 def _apply_short_forms(cfg: TrainConfig, rank: ProcessRank) -> None:
     if cfg.num_envs is not None:
         cfg.env.scene.num_envs = cfg.num_envs
@@ -297,6 +263,11 @@ def _learn(
         runner.learn(cfg.agent.max_iterations, init_at_random_ep_len=True)
         return
     runner.observers += [_Beginning(folder), TrainingDisplay(task)]
+    if cfg.live:
+        from mjlab.scripts.live import LiveView
+
+        # First, because the display keeps the terminal to itself once it has started.
+        runner.observers.insert(0, LiveView(task, cfg, runner))
     try:
         runner.learn(cfg.agent.max_iterations, init_at_random_ep_len=True)
         # A task's own runner may have its own loop, which need not tell that it starts.

@@ -53,8 +53,16 @@ _FRAME_MARKS = {
 }
 _INERTIAL_FRAME = ("body_ipos", "body_iquat")
 
-# Changing these per environment would change which contacts and array sizes exist.
-_STRUCTURAL_FIELDS = frozenset({"geom_type", "geom_bodyid", "body_parentid", "jnt_type", "eq_type"})
+# Whole numbers in a model are addresses, kinds and masks, from which array sizes and the pairs that
+# may collide were compiled; changed in one environment they would act in part or not at all. These
+# are the ones that MuJoCo looks up each time and that nothing was compiled from.
+_FREE_INTEGERS = frozenset(
+    {"geom_matid", "geom_dataid", "geom_condim", "geom_priority", "mat_texid", "mat_texuniform"}
+    | {"site_matid", "tendon_matid", "light_active", "light_castshadow", "light_type"}
+    | {"jnt_limited", "tendon_limited", "jnt_actfrclimited", "tendon_actfrclimited"}
+    | {"actuator_ctrllimited", "actuator_forcelimited", "actuator_actlimited"}
+)
+_DERIVED_BY_ENGINE = frozenset({"body_margin"})
 
 
 class NativeEngine(Engine):
@@ -169,7 +177,9 @@ class NativeEngine(Engine):
                 self._midphase = MidphaseMargins(self._model, self.num_envs, self._batch.expand)
 
     def _check_expandable(self, name: str) -> None:
-        if name in _STRUCTURAL_FIELDS:
+        value = getattr(self._model, name, None)
+        counts = isinstance(value, np.ndarray) and value.dtype.kind in "iub"
+        if (counts and name not in _FREE_INTEGERS) or name in _DERIVED_BY_ENGINE:
             raise ValueError(
                 f"Model field {name!r} is part of the model's structure and cannot differ between "
                 "environments. Use several entities, or several tasks."

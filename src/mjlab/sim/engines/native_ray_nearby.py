@@ -32,7 +32,7 @@ def cluster_rays(positions: Array, sources: Array) -> list[list[Array]]:
         For each class, the ray indices of its clusters.
     """
     pending = [np.flatnonzero(sources == source) for source in np.unique(sources)]
-    clusters = []
+    clusters: list[Array] = []
     while pending:
         rays = pending.pop()
         extent = np.ptp(positions[rays], axis=0)
@@ -44,7 +44,7 @@ def cluster_rays(positions: Array, sources: Array) -> list[list[Array]]:
             continue
         order = rays[np.argsort(positions[rays, extent.argmax()], kind="stable")]
         pending += [order[: len(rays) // 2], order[len(rays) // 2 :]]
-    clusters.sort(key=len, reverse=True)
+    clusters.sort(key=lambda rays: -len(rays))
     classes: list[list[Array]] = []
     for cluster in clusters:
         if classes and len(cluster) >= _SIMILAR * len(classes[-1][0]):
@@ -140,7 +140,7 @@ class NearbyRays:
             geomgroup=self._mask,
         )
         self._scatter(out)
-        return strays.reshape(self._num_envs, -1).any(axis=1)
+        return np.asarray(strays.reshape(self._num_envs, -1).any(axis=1))
 
     def _gather_directions(
         self, directions: torch.Tensor, reach: torch.Tensor | None, shape: tuple[int, int]

@@ -81,9 +81,11 @@ def static_geoms(model: mujoco.MjModel, data: mujoco.MjData, chosen: Array) -> S
     ids = np.flatnonzero(chosen)
     kind, pos = model.geom_type[ids], data.geom_xpos[ids].copy()
     mat = data.geom_xmat[ids].reshape(-1, 3, 3)
-    quat = np.empty((len(ids), 4))
-    for i, matrix in enumerate(mat):
-        mujoco.mju_mat2Quat(quat[i], matrix.reshape(9))
+    # Where the body is not turned, the geom's own orientation is its world orientation, to the bit.
+    quat = model.geom_quat[ids].copy()
+    is_turned = (data.xquat[model.geom_bodyid[ids]] != (1.0, 0.0, 0.0, 0.0)).any(axis=1)
+    for i in np.flatnonzero(is_turned):
+        mujoco.mju_mat2Quat(quat[i], mat[i].reshape(9))
     # Boxes around the geoms in their own frames; a height field reaches from its base to its top.
     centre, half = model.geom_aabb[ids, :3].copy(), model.geom_aabb[ids, 3:].copy()
     fields = kind == _HFIELD

@@ -18,11 +18,17 @@ _SENSORS_BY_FIELD = {
 
 
 def refuse_without_sensor(model: mujoco.MjModel, field: str) -> None:
-    """Raise if `field` is computed only for sensors that `model` does not have.
+    """Raise if `field` is computed only for sensors that `model` does not have, or never.
 
     Raises:
-        AttributeError: names the sensors of which one has to be added.
+        AttributeError: names the sensors of which one has to be added, or what to read instead.
     """
+    if field == "qfrc_inverse":
+        # Inverse dynamics are no part of a step, so it would read zero for ever.
+        raise AttributeError(
+            "MuJoCo computes MjData.qfrc_inverse in inverse dynamics only, which no step runs. The "
+            "forces that drive the joints are qfrc_actuator + qfrc_applied."
+        )
     sensors = _SENSORS_BY_FIELD.get(field)
     if sensors is None:
         return

@@ -28,7 +28,6 @@ log = logging.getLogger(__name__)
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8080
 
-_SCENE_PERIOD_S = 1.0 / 30.0
 _PANEL_PERIOD_S = 0.2
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
@@ -39,6 +38,9 @@ class ViserPlayViewer(BaseViewer):
     The page is served to this machine only, unless `host` says otherwise: whoever can open it can
     control the run. Everything that touches the environment happens in the thread of `run`.
     """
+
+    # Wall time from one drawing of the scene to the next, in seconds.
+    scene_period = 1.0 / 30.0
 
     def __init__(
         self,
@@ -132,6 +134,9 @@ class ViserPlayViewer(BaseViewer):
             self._closed = True
             self._server.stop()
 
+    def add_first_panels(self) -> None:
+        """Add to the top of the Controls tab; for subclasses, nothing by default."""
+
     def sync_viewer_to_env(self) -> None:
         # Commands' own panels write into their terms; nothing else goes this way.
         pass
@@ -140,7 +145,7 @@ class ViserPlayViewer(BaseViewer):
         now = time.perf_counter()
         changed = self._dirty or self.scene.redraw_requested
         if changed and now >= self._next_scene:
-            self._next_scene = now + _SCENE_PERIOD_S
+            self._next_scene = now + self.scene_period
             self._dirty = False
             self._forget_history_of_other_env()
             self.scene.draw(self.env.unwrapped.sim, self.env.unwrapped.update_visualizers)
@@ -187,6 +192,7 @@ class ViserPlayViewer(BaseViewer):
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Controls", icon=viser.Icon.SETTINGS):
+            self.add_first_panels()
             self._controls = SimulationControls(self._server, self.request_action)
             self._add_command_panels()
             with gui.add_folder("Scene"):
