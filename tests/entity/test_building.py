@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import zipfile
 
 import mujoco
@@ -75,6 +76,43 @@ def test_two_free_joints_are_refused(kit):
       <body name="b"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
     with pytest.raises(ValueError, match=r"'pair' has 2 free joints, of the bodies \['a', 'b'\]"):
         kit.cfg(xml).build()
+
+
+SERVO = BuiltinPositionActuatorCfg(target_names_expr=("hip", "knee"), stiffness=1.0, damping=1.0)
+MOTOR = BuiltinMotorActuatorCfg(target_names_expr=("k.*",), effort_limit=1.0)
+IN_XML = '<actuator><motor name="drive" joint="knee"/></actuator></mujoco>'
+
+
+@pytest.mark.parametrize(
+    ("actuators", "in_xml", "said"),
+    [
+        ((SERVO, MOTOR), False, r"MotorActuatorCfg.*'knee' has one by BuiltinPositionActuatorCfg"),
+        ((SERVO, SERVO), False, r"'hip' has one .*, 'knee' has one "),
+        ((SERVO,), True, r"'knee' has the actuator 'drive' of the XML.*XmlActuatorCfg"),
+        ((XmlActuatorCfg(target_names_expr=("knee",)), MOTOR), True, "'knee' has the actuator 'drive'"),
+        ((XmlActuatorCfg(target_names_expr=("knee",)),) * 2, True, "'knee' has one by XmlActuator"),
+    ],
+)
+def test_an_actuator_on_a_joint_that_has_one_already_is_refused(kit, actuators, in_xml, said):
+    xml = kit.ROBOT.replace("</mujoco>", IN_XML) if in_xml else kit.ROBOT
+    for order in (actuators, actuators[::-1]):
+        for sort in (False, True):
+            cfg = kit.cfg(xml, sort_actuators=sort, articulation=actuated(*order))
+            with pytest.raises(ValueError, match="that have an actuator already") as caught:
+                cfg.build()
+            if order is actuators:
+                assert re.search(said, str(caught.value))
+
+
+def test_actuators_of_the_xml_and_others_may_share_a_pattern_but_no_joint(kit):
+    """The one that wraps those of the XML leaves out joints that have none, whatever the order."""
+    motor = BuiltinMotorActuatorCfg(target_names_expr=("hip",), effort_limit=1.0)
+    wrapped = XmlActuatorCfg(target_names_expr=("hip", "knee"))
+    for actuators in ((motor, wrapped), (wrapped, motor)):
+        xml = kit.ROBOT.replace("</mujoco>", IN_XML)
+        robot = kit.cfg(xml, articulation=actuated(*actuators)).build()
+        by_config = {type(a.cfg): a.target_names for a in robot.actuators}
+        assert by_config == {BuiltinMotorActuatorCfg: ["hip"], XmlActuatorCfg: ["knee"]}
 
 
 def test_a_free_joint_that_is_not_first_is_refused(kit):
@@ -289,12 +327,11 @@ def test_sorted_actuators_follow_their_targets_after_those_of_the_xml(kit):
                 target_names_expr=("foot",), transmission_type=TransmissionType.SITE,
                 effort_limit=1.0,
             ),
-            BuiltinMotorActuatorCfg(target_names_expr=("knee",), effort_limit=1.0),
             XmlActuatorCfg(target_names_expr=("knee",)),
             BuiltinMotorActuatorCfg(target_names_expr=("hip",), effort_limit=1.0),
         ),
     ).build()  # fmt: skip
-    assert robot.actuator_names == ("knee_xml", "hip", "knee", "foot")
+    assert robot.actuator_names == ("knee_xml", "hip", "foot")
 
 
 def test_sorted_native_pd_writes_the_right_controls(kit):

@@ -27,6 +27,8 @@ CART = """
 </mujoco>
 """
 
+BARE_CART = CART.replace('<actuator><motor name="push" joint="slider"/></actuator>', "")
+
 
 def cfg(xml: str, option: str = "", **fields) -> EntityCfg:
     text = xml.format(option=f"<option {option}" if option else "")
@@ -44,4 +46,4 @@ def make(**fields) -> tuple[Simulation, Scene]:
 @pytest.fixture
 def kit() -> SimpleNamespace:
     """The helpers of this file. `cfg(xml, 'timestep=".01"/>')` adds an option block."""
-    return SimpleNamespace(BOX=BOX, CART=CART, cfg=cfg, make=make)
+    return SimpleNamespace(BOX=BOX, CART=CART, BARE_CART=BARE_CART, cfg=cfg, make=make)

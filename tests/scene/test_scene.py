@@ -132,7 +132,7 @@ def test_the_keyframe_holds_the_resolved_state_of_every_entity(kit):
             "first": kit.cfg(keyed, init_state=InitialState(joint_pos={"slider": 0.1})),
             "box": kit.cfg(kit.BOX, init_state=InitialState(pos=(1.0, 2.0, 3.0))),
             "second": kit.cfg(
-                kit.CART,
+                kit.BARE_CART,
                 init_state=InitialState(joint_pos={"slider": 0.2}),
                 articulation=position,
             ),
@@ -141,7 +141,7 @@ def test_the_keyframe_holds_the_resolved_state_of_every_entity(kit):
     model = scene.compile()
     assert [model.key(i).name for i in range(model.nkey)] == ["init_state"]
     assert model.key("init_state").qpos.tolist() == [0.1, 1, 2, 3, 1, 0, 0, 0, 0.2]
-    assert model.key("init_state").ctrl.tolist() == [0.0, 0.0, 0.2]
+    assert model.key("init_state").ctrl.tolist() == [0.0, 0.2]
 
 
 def test_the_keyframe_covers_joints_that_the_scene_adds_itself(kit):
@@ -259,7 +259,7 @@ def test_only_what_acts_between_substeps_asks_for_them(kit):
         )
 
     def cart(**delay):
-        return {"cart": kit.cfg(kit.CART, articulation=articulated(**delay))}
+        return {"cart": kit.cfg(kit.BARE_CART, articulation=articulated(**delay))}
 
     assert not build(entities={**cart(), "box": kit.cfg(kit.BOX)}).needs_substep
     assert build(entities=cart(delay_max_lag=2)).needs_substep

@@ -154,16 +154,19 @@ def test_ground_that_every_environment_places_for_itself_is_found_where_it_is(en
     sim, scene = scene_with(
         height(pattern=RingPatternCfg(())),
         ground=lambda spec: None,
-        num_envs=3,
+        num_envs=4,
         engine=engine,
         entities={"robot": ROBOT, "slab": slab},
     )
-    sim.data.mocap_pos[:, 0] = torch.tensor([[0.0, 0, 0], [0, 0, 2.0], [5.0, 0, 2.0]])
-    put(sim, *[[0.0, 0.0, 1.0]] * 3)
+    positions = [[0.0, 0, 0], [0, 0, 2.0], [5.0, 0, 2.0], [0.0, 0, 0.8]]
+    sim.data.mocap_pos[:, 0] = torch.tensor(positions)
+    put(sim, *[[0.0, 0.0, 1.0]] * 4)
     sense(sim)
+    # The field is 0.5 high here; in the last environment the robot is below its surface.
     torch.testing.assert_close(
-        scene["height"].data.heights[:, 0], torch.tensor([0.5, 0.0, 2.0]), atol=1e-5, rtol=0
+        scene["height"].data.heights[:, 0], torch.tensor([0.5, 0.0, 2.0, 0.0]), atol=1e-5, rtol=0
     )
+    assert (scene["height"].data.distances[1:] == -1.0).all()
 
 
 def test_other_reductions_are_refused():

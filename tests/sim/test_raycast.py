@@ -170,8 +170,8 @@ def test_both_engines_meet_the_same_on_any_ray():
 # Only what is near.
 
 
-def terrain_model(turned: bool, moving: bool, hills: bool) -> mujoco.MjModel:
-    """Steps, balls and hills in rows, with something that moves above them."""
+def terrain_model(turned: bool, moving: bool, hills: bool, meshes: bool = False) -> mujoco.MjModel:
+    """Blocks, drums, hills and rocks in rows, with something that moves above them."""
     rng = np.random.default_rng(0)
     spec = mujoco.MjSpec()
     kinds = [mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER]
@@ -192,6 +192,14 @@ def terrain_model(turned: bool, moving: bool, hills: bool) -> mujoco.MjModel:
             spec.worldbody.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=f"h{k}", pos=[4.0 + 2 * k, 0, 0]
             )
+    for k in range(8 * meshes):
+        spec.add_mesh(name=f"rock{k}", uservert=rng.uniform(-0.5, 0.5, 36))
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=f"rock{k}",
+            pos=[k - 3, 3.5, 0.1 * k],
+            quat=rng.normal(size=4),
+        )
     body = spec.worldbody.add_body(name="body", pos=[0, 0, 1])
     body.add_freejoint()
     body.add_geom(size=[0.05, 0.05, 0.05], group=0 if moving else 2)
@@ -284,6 +292,26 @@ def hilly():
     for _ in range(2):
         sims[0].raycast(points, torch.tensor(DOWN).repeat(2, 40, 1), None, None, torch.ones(40))
     return sims
+
+
+def test_what_is_near_is_met_as_everything_is_to_the_bit():
+    model = terrain_model(turned=True, moving=True, hills=True, meshes=True)
+    sim = Simulation(64, SimulationCfg(engine="native"), model=model, device="cpu")
+    generator = torch.Generator().manual_seed(3)
+    places = torch.rand(64, 1, 3, generator=generator) * torch.tensor([12.0, 8.0, 1.0])
+    spots = 0.3 * torch.rand(30, 3, generator=generator) - torch.tensor([4.0, 4.0, 0.2])
+    origins = places + spots
+    directions = torch.randn(30, 3, generator=generator) * torch.tensor([0.2, 0.2, 1.0])
+    directions = torch.nn.functional.normalize(directions, dim=-1).repeat(64, 1, 1)
+    reach = torch.full((30,), 1.5)
+    # The first call looks at everything, the second at what is near.
+    everything, near = [sim.raycast(origins, directions, None, None, reach) for _ in range(2)]
+    assert all(plan.parts for plan in sim._engine._rays._plans.values())
+    met = model.geom_type[everything[2][everything[0] >= 0].numpy()]
+    kinds = {"PLANE", "HFIELD", "CYLINDER", "BOX", "MESH"}
+    assert {mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_") for kind in met} >= kinds
+    for a, b in zip(everything, near, strict=True):
+        assert torch.equal(a, b)
 
 
 def test_geoms_that_a_randomization_has_moved_are_met_where_they_are():

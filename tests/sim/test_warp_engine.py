@@ -95,8 +95,22 @@ def test_a_gpu_that_is_not_there_is_refused() -> None:
 
 def test_too_small_a_capacity_is_refused_at_construction() -> None:
     xml = LANDING_BOX.replace('pos="0 0 .4"', 'pos="0 0 .04"')
-    with pytest.raises(ValueError, match=r"nconmax=1.*SimulationCfg\.nconmax"):
-        make_engine(xml, nconmax=1)
+    with pytest.raises(ValueError, match=r"njmax=1 or.*SimulationCfg\.nconmax or njmax"):
+        make_engine(xml, njmax=1)
+
+
+def test_contacts_of_a_reference_pose_that_no_episode_starts_in_are_no_reason_to_refuse(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """At the origin of the world a robot may be deep inside a generated terrain."""
+    xml = LANDING_BOX.replace('pos="0 0 .4"', 'pos="0 0 .04"')
+    engine = make_engine(xml, nconmax=1)
+    assert "4 contacts, more than SimulationCfg.nconmax=1" in caplog.text
+    native = make_engine(LANDING_BOX, nconmax=8)
+    moved = native.data_field("xpos") - torch.tensor([0.0, 0.0, 0.36])
+    # Everything else is that of the reference pose, and contacts work as soon as there are fewer.
+    torch.testing.assert_close(engine.data_field("xpos")[:, 1], moved[:, 1])
+    assert not engine.wp_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
 
 
 @pytest.mark.parametrize("field", ["geom_contype", "hfield_data", "jnt_type"])

@@ -83,7 +83,6 @@ def _make_viewer(job: LiveJob, exchange: Exchange, server: viser.ViserServer) ->
     runner = job.runner_cls(wrapped, asdict(job.agent), None, "cpu")
     network = runner.alg.get_policy()
     weights = NewestWeights(exchange, network, env)
-    weights.take()
     return LiveViewer(
         wrapped,
         runner.get_inference_policy(device="cpu"),

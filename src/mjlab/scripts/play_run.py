@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -48,6 +49,8 @@ class PlayConfig(PolicyFlags):
     """Address that the page is served on; 0.0.0.0 serves the whole network."""
     port: int = 8080
     """Port that the page is served on."""
+    open_browser: bool = False
+    """Open the page in this machine's browser, if there is a display."""
     no_terminations: bool = False
     """Switch off every termination, the time limit included."""
 
@@ -75,15 +78,18 @@ def run_play(task: str, cfg: PlayConfig) -> None:
     if cfg.video:
         _record(task, cfg, env_cfg, checkpoint, device)
         return
+    from mjlab.rl.threads import threads_for_policy
+
     env = make_env(task, env_cfg, device, cfg.num_envs, cfg.engine, profile=cfg.profile)
     print(f"Physics:    {env.unwrapped.sim.capabilities.description}")
     try:
         policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
-        if cfg.viewer == "none" and cfg.num_steps is not None:
-            _play_headless(env, policy, cfg.num_steps)
-        else:
-            viewer = _make_viewer(task, cfg, env, policy, checkpoint, device)
-            viewer.run(num_steps=cfg.num_steps)
+        with threads_for_policy(policy, env.num_envs, device):
+            if cfg.viewer == "none" and cfg.num_steps is not None:
+                _play_headless(env, policy, cfg.num_steps)
+            else:
+                viewer = _make_viewer(task, cfg, env, policy, checkpoint, device)
+                viewer.run(num_steps=cfg.num_steps)
     finally:
         env.close()
 
@@ -101,9 +107,7 @@ def _play_headless(env: Any, policy: Any, num_steps: int) -> None:
 def _make_viewer(
     task: str, cfg: PlayConfig, env: Any, policy: Any, checkpoint: Path | None, device: str
 ) -> Any:
-    has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    native = cfg.viewer == "native" or (cfg.viewer == "auto" and has_display)
-    if native:
+    if cfg.viewer == "native" or (cfg.viewer == "auto" and _has_display()):
         from mjlab.viewer import NativeMujocoViewer
 
         return NativeMujocoViewer(env, policy)
@@ -111,15 +115,28 @@ def _make_viewer(
     from mjlab.viewer.viser.checkpoints import LocalCheckpoints
 
     source = None
-    if checkpoint is not None:
+    if checkpoint is not None and any(checkpoint.parent.glob("*.pt")):
         source = LocalCheckpoints(
             checkpoint.parent,
             lambda path: load_policy(task, env, path, device, cfg.profile),
             current=checkpoint.name,
         )
     viewer = ViserPlayViewer(env, policy, checkpoints=source, host=cfg.host, port=cfg.port)
-    print(f"Open {viewer.url} in a browser. Ctrl-C ends.")
+    print(f"Open {viewer.url} in a browser. Ctrl-C ends.", flush=True)
+    if cfg.open_browser and _can_open_browser():
+        import webbrowser
+
+        webbrowser.open(viewer.url)
     return viewer
+
+
+def _has_display() -> bool:
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _can_open_browser() -> bool:
+    # Without a display, Linux would open a browser for the terminal, in this terminal.
+    return sys.platform in ("darwin", "win32") or _has_display()
 
 
 def _record(

@@ -128,27 +128,32 @@ class World:
 WorldFactory = Callable[..., World]
 
 
+def build_world(
+    xml: str = ROBOT_XML,
+    num_envs: int = 4,
+    engine: str = "native",
+    actuators: tuple[Any, ...] = (),
+    **cfg: Any,
+) -> World:
+    """Make a world from an XML, with actuators if wanted."""
+    articulation = EntityArticulationInfoCfg(actuators=actuators, soft_joint_pos_limit_factor=0.9)
+    entity_cfg = EntityCfg(
+        spec_fn=lambda: mujoco.MjSpec.from_string(xml), articulation=articulation, **cfg
+    )
+    return World(entity_cfg, num_envs, engine)
+
+
+@pytest.fixture(scope="session")
+def world_factory() -> WorldFactory:
+    """Return `build_world`, for worlds that several tests share."""
+    return build_world
+
+
 @pytest.fixture
 def make_world() -> WorldFactory:
-    """Make a world from an XML, with actuators if wanted."""
+    """Return `build_world`, with the generator seeded."""
     torch.manual_seed(0)
-
-    def make(
-        xml: str = ROBOT_XML,
-        num_envs: int = 4,
-        engine: str = "native",
-        actuators: tuple[Any, ...] = (),
-        **cfg: Any,
-    ) -> World:
-        articulation = EntityArticulationInfoCfg(
-            actuators=actuators, soft_joint_pos_limit_factor=0.9
-        )
-        entity_cfg = EntityCfg(
-            spec_fn=lambda: mujoco.MjSpec.from_string(xml), articulation=articulation, **cfg
-        )
-        return World(entity_cfg, num_envs, engine)
-
-    return make
+    return build_world
 
 
 @pytest.fixture

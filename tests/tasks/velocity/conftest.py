@@ -12,24 +12,11 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
-from mjlab.tasks.registry import load_env_cfg
+from velocity_tasks import GO1_FLAT, task_cfg
 
-GO1_FLAT = "Mjlab-Velocity-Flat-Unitree-Go1"
-GO1_ROUGH = "Mjlab-Velocity-Rough-Unitree-Go1"
+from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 
 EnvFactory = Callable[..., ManagerBasedRlEnv]
-
-
-def task_cfg(task: str = GO1_FLAT, num_envs: int = 4, play: bool = False) -> ManagerBasedRlEnvCfg:
-    """Return the config of a task with few environments, and a small grid where it has one."""
-    cfg = load_env_cfg(task, play=play)
-    cfg.scene.num_envs, cfg.seed, cfg.sim.engine = num_envs, 1, "native"
-    cfg.sim.num_threads = 1
-    if cfg.scene.terrain and cfg.scene.terrain.terrain_generator:
-        cfg.scene.terrain.terrain_generator.num_rows = 3
-        cfg.scene.terrain.terrain_generator.seed = 3
-    return cfg
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import pytest
-from conftest import GO1_ROUGH
+from velocity_tasks import GO1_ROUGH
 
 from mjlab.sensor import BuiltinSensorCfg, ObjRef
 from mjlab.tasks.velocity.variants import get_sensor, remove_sensors
@@ -50,7 +50,9 @@ def test_a_sensor_that_observations_need_is_named_too(make_env, group, term):
     def edit(cfg):
         cfg.observations[group].terms[term].params["sensor_name"] = "foot_height_scn"
 
-    with pytest.raises(ValueError, match=f"'critic/{term}': .*no sensor 'foot_height_scn'. Did you"):
+    with pytest.raises(
+        ValueError, match=f"'critic/{term}': .*no sensor 'foot_height_scn'. Did you"
+    ):
         make_env(edit=edit)
 
 
@@ -199,7 +201,7 @@ def test_upright_needs_rays_of_a_sensor_that_exists(make_env):
 
 
 def test_an_unknown_sensor_of_a_config_is_named_with_those_that_exist():
-    from conftest import task_cfg
+    from velocity_tasks import task_cfg
 
     with pytest.raises(KeyError, match=r"No sensor 'scan'; there are \['foot_height_scan'"):
         get_sensor(task_cfg(), "scan")

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import GO1_ROUGH
 from stand_ins import StandInEnv, velocity_command
+from velocity_tasks import GO1_ROUGH
 
 from mjlab.tasks.velocity import mdp
 from mjlab.tasks.velocity.mdp.curriculums import VelocityStage
@@ -31,9 +31,7 @@ class Terrain:
     def update_env_origins(
         self, env_ids: torch.Tensor, move_up: torch.Tensor, move_down: torch.Tensor
     ) -> None:
-        self.moves.append(
-            (env_ids.tolist(), move_up.long().tolist(), move_down.long().tolist())
-        )
+        self.moves.append((env_ids.tolist(), move_up.long().tolist(), move_down.long().tolist()))
 
 
 def walked(*distances: float, speed: float = 0.5, counter: int = 100) -> Any:
@@ -163,7 +161,8 @@ STAGES: list[VelocityStage] = [
 
 
 @pytest.mark.parametrize(
-    ("counter", "forward"), [(0, (-1.0, 1.0)), (9, (-1.0, 1.0)), (10, (-1.5, 2.0)), (99, (-2.0, 3.0))]
+    ("counter", "forward"),
+    [(0, (-1.0, 1.0)), (9, (-1.0, 1.0)), (10, (-1.5, 2.0)), (99, (-2.0, 3.0))],
 )
 def test_later_stages_win_and_what_they_do_not_give_stays(counter, forward):
     env, term = velocity_command(StandInEnv(4))

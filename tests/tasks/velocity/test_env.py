@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from conftest import GO1_FLAT, GO1_ROUGH, task_cfg
+from velocity_tasks import GO1_FLAT, GO1_ROUGH, task_cfg
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl.rng import rng_state, set_rng_state
@@ -174,7 +174,13 @@ def test_peaks_errors_and_kinds_of_commands_go_on_too(make_env):
     other.reset()
     other.load_state_dict(state)
     one, two = (e.command_manager.get_term("twist") for e in (env, other))
-    for name in ("vel_command_b", "heading_target", "is_heading_env", "is_standing_env", "_samples"):
+    for name in (
+        "vel_command_b",
+        "heading_target",
+        "is_heading_env",
+        "is_standing_env",
+        "_samples",
+    ):
         assert torch.equal(getattr(one, name), getattr(two, name)), name
     for name in one.metrics:
         assert torch.equal(one.metrics[name], two.metrics[name])
@@ -194,5 +200,3 @@ def test_environments_do_not_go_on_on_another_terrain(make_env):
     with pytest.raises(ValueError, match="another terrain.*resume with the seed"):
         other.load_state_dict(state)
     assert torch.equal(other.scene.terrain.terrain_levels, levels)
-
-

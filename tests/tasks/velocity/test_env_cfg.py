@@ -6,7 +6,7 @@ import copy
 
 import pytest
 import torch
-from conftest import GO1_FLAT, GO1_ROUGH
+from velocity_tasks import GO1_FLAT, GO1_ROUGH
 
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.tasks.velocity.config.g1 import unitree_g1_flat_env_cfg, unitree_g1_rough_env_cfg
@@ -90,7 +90,9 @@ def test_the_base_config_without_a_robot_is_refused(make_env):
         base = make_velocity_env_cfg()
         cfg.rewards = {"foot_slip": base.rewards["foot_slip"]}
 
-    with pytest.raises(ValueError, match="'foot_slip': asset_cfg selects no site of entity 'robot'"):
+    with pytest.raises(
+        ValueError, match="'foot_slip': asset_cfg selects no site of entity 'robot'"
+    ):
         make_env(edit=edit)
 
 
@@ -141,7 +143,9 @@ def test_observations_and_actions_are_as_wide_as_documented(make_env, task, acto
 
 def test_friction_of_the_feet_is_drawn_on_three_axes_that_compose(make_env):
     env = make_env(num_envs=64)
-    geoms = [env.sim.mj_model.geom(f"robot/{f}_foot_collision").id for f in ("FR", "FL", "RR", "RL")]
+    geoms = [
+        env.sim.mj_model.geom(f"robot/{f}_foot_collision").id for f in ("FR", "FL", "RR", "RL")
+    ]
     friction = env.sim.model.geom_friction[:, geoms]
     bounds = ((0.3, 1.5), (1e-4, 2e-2), (1e-5, 5e-3))
     for axis, (low, high) in enumerate(bounds):

@@ -324,8 +324,8 @@ def test_ranges_change_in_the_term_and_not_in_the_config():
         ),
         ({"rel_standing_envs": 1.2}, "rel_standing_envs is 1.2; a share is between 0 and 1"),
         ({"init_velocity_prob": -0.1}, "init_velocity_prob is -0.1"),
-        ({"resampling_time_range": (-1.0, 2.0)}, "times cannot be negative"),
-        ({"resampling_time_range": (3.0, 2.0)}, "must not be larger than the second"),
+        ({"resampling_time_range": (-1.0, 2.0)}, "must not be negative"),
+        ({"resampling_time_range": (3.0, 2.0)}, "nor the first larger than the second"),
     ],
 )
 def test_what_makes_no_sense_is_refused_when_the_command_is_built(fields, message):
@@ -337,7 +337,9 @@ def test_an_entity_that_does_not_exist_is_refused_with_those_that_do(make_env):
     def edit(cfg):
         cfg.commands["twist"].entity_name = "robto"
 
-    with pytest.raises(ValueError, match=r"'twist': entity_name is 'robto'.*\['terrain', 'robot'\]"):
+    with pytest.raises(
+        ValueError, match=r"'twist': entity_name is 'robto'.*\['terrain', 'robot'\]"
+    ):
         make_env(edit=edit)
 
 

@@ -267,6 +267,10 @@ class NativeEngine(Engine):
                 self._model,
                 self._batch,
                 lambda model, count: mjbatch.Batch(model, count, threads),
+                lambda: (
+                    self.data_field("geom_xpos").numpy(),
+                    self.data_field("geom_xmat").numpy(),
+                ),
             )
         hits = self._rays.cast(
             origins,

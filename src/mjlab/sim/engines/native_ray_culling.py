@@ -24,11 +24,14 @@ class CullingRule:
     """Says which hits on the geoms of a model do not count."""
 
     def __init__(self, model: mujoco.MjModel, pos: Array, mat: Array) -> None:
-        """Take the world poses of the geoms, (ngeom, 3) and (ngeom, 9).
+        """Take the poses of geoms that do not move, (ngeom, 3) and (ngeom, 9).
 
-        The poses count for height fields only, which do not move.
+        They count for height fields, which move only where a mocap body carries them.
         """
         self._model = model
+        roots = model.body_rootid[model.geom_bodyid[model.geom_type == _HFIELD]]
+        self.fields_are_carried = bool((model.body_mocapid[roots] >= 0).any())
+        """Whether each environment places a height field for itself."""
         # One entry more, so that the geom -1 of a miss finds an entry of its own.
         self._is_field = np.append(model.geom_type == _HFIELD, False)
         self._is_one_sided = self._is_field | np.append(model.geom_type == _MESH, False)
@@ -45,51 +48,74 @@ class CullingRule:
         return bool((self._is_one_sided[:-1] & geoms).any())
 
     def passed(
-        self, origins: Array, directions: Array, distances: Array, normals: Array, geoms: Array
+        self,
+        origins: Array,
+        directions: Array,
+        distances: Array,
+        normals: Array,
+        geoms: Array,
+        poses: tuple[Array, Array] | None = None,
     ) -> Array:
-        """Return which hits (...,) do not count; vectors are (..., 3), geoms -1 for a miss."""
+        """Return which hits (n, R) do not count; vectors are (n, R, 3), geoms -1 for a miss.
+
+        `poses` are the positions (n, ngeom, 3) and orientations (n, ngeom, 3, 3) of the geoms,
+        where height fields are carried.
+        """
         facing = np.einsum("...k,...k", normals, directions)
         passed = self._is_one_sided[geoms] & (facing >= 0.0)
         is_field = self._is_field[geoms]
         if not is_field.any():
             return passed
-        if self._is_upright:
+        if self._is_upright and poses is None:
             up = normals[..., 2]
             height = origins[..., 2] + directions[..., 2] * distances - self._base[geoms]
         else:
-            axis = self._mat[geoms, :, 2]
+            pos, mat = self._poses_of(geoms, poses)
+            axis = mat[..., :, 2]
             up = np.einsum("...k,...k", normals, axis)
-            hit = origins + directions * distances[..., None] - self._pos[geoms]
+            hit = origins + directions * distances[..., None] - pos
             height = np.where(is_field, np.einsum("...k,...k", hit, axis), np.nan)
         passed |= is_field & (up <= _SIDE)
         # Rays from below the surface end on the base, which looks like flat ground.
-        flat = (np.abs(height) < _BASE_TOLERANCE) & ~passed
-        index = np.nonzero(flat)
+        index = np.nonzero((np.abs(height) < _BASE_TOLERANCE) & ~passed)
         if len(index[0]):
+            if poses is not None:
+                poses = (poses[0][index[0]], poses[1][index[0]])
             at = (array[index] for array in (origins, directions, distances, geoms))
-            passed[index] = self._begins_below(*at)
+            passed[index] = self._begins_below(*at, poses)
         return passed
 
+    def _poses_of(self, geoms: Array, poses: tuple[Array, Array] | None) -> tuple[Array, Array]:
+        """Return positions (..., 3) and orientations (..., 3, 3) of geoms (...,)."""
+        if poses is None:
+            return self._pos[geoms], self._mat[geoms]
+        rows = np.arange(len(geoms)).reshape(-1, *[1] * (geoms.ndim - 1))
+        return poses[0][rows, geoms], poses[1][rows, geoms]
+
     def _begins_below(
-        self, origins: Array, directions: Array, distances: Array, geoms: Array
+        self,
+        origins: Array,
+        directions: Array,
+        distances: Array,
+        geoms: Array,
+        poses: tuple[Array, Array] | None,
     ) -> Array:
         """Return for hits (M,) at the height of the base whether the surface is above them."""
-        axis = self._mat[geoms, :, 2]
-        climb = -np.einsum("mk,mk->m", directions, axis) * distances
+        pos, mat = self._poses_of(geoms, poses)
+        climb = -np.einsum("mk,mk->m", directions, mat[:, :, 2]) * distances
         below = climb < self._elevation[geoms]
         if below.any():
             hits = origins[below] + directions[below] * distances[below, None]
-            surface = self._surface(hits, geoms[below])
-            below[below] = surface > _SURFACE_TOLERANCE
+            local = np.einsum("mkj,mk->mj", mat[below], hits - pos[below])
+            below[below] = self._surface(local, geoms[below]) > _SURFACE_TOLERANCE
         return below
 
-    def _surface(self, points: Array, geoms: Array) -> Array:
-        """Return the height of height fields (M,) at world points (M, 3), above their base.
+    def _surface(self, local: Array, geoms: Array) -> Array:
+        """Return the height of height fields (M,) at local positions (M, 3), above their base.
 
         Each cell is two triangles, cut from its first to its last corner.
         """
         m = self._model
-        local = np.einsum("mkj,mk->mj", self._mat[geoms], points - self._pos[geoms])
         fields = m.geom_dataid[geoms]
         cells = np.stack((m.hfield_ncol[fields] - 1, m.hfield_nrow[fields] - 1), axis=-1)
         scaled = (local[:, :2] / m.hfield_size[fields, :2] + 1.0) / 2.0 * cells

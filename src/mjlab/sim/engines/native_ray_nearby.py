@@ -129,7 +129,7 @@ class NearbyRays:
         start = origins.index_select(1, self._columns).view(*shape, 3)
         along, sideways = self._gather_directions(directions, reach, shape)
         centre, half = self._bounds(start, sideways)
-        strays = ~(half <= self.margin).all(axis=1)
+        strays = (half > self.margin).any(axis=1)
         self._load(centre)
         cast_through(
             self._batch,

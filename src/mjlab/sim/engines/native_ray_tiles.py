@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 _T = mujoco.mjtGeom
-# Geoms that can be moved from simulation to simulation: a mesh or SDF has data of its own kind.
+# Geoms that a slot can stand for.
 _KINDS = tuple(
     int(kind)
     for kind in (
@@ -20,9 +20,10 @@ _KINDS = tuple(
         _T.mjGEOM_ELLIPSOID,
         _T.mjGEOM_CYLINDER,
         _T.mjGEOM_BOX,
+        _T.mjGEOM_MESH,
     )
 )
-_PLANE, _HFIELD = int(_T.mjGEOM_PLANE), int(_T.mjGEOM_HFIELD)
+_PLANE, _HFIELD, _MESH = int(_T.mjGEOM_PLANE), int(_T.mjGEOM_HFIELD), int(_T.mjGEOM_MESH)
 _MAX_TILES = 250_000
 
 Array = np.ndarray
@@ -43,7 +44,7 @@ class StaticGeoms:
     size: Array
     """(G, 3) sizes."""
     dataid: Array
-    """(G,) height field, or -1."""
+    """(G,) height field or mesh, or -1."""
     low: Array
     """(G, 2) lower corner of what they cover of the ground; -inf for planes."""
     high: Array
@@ -73,7 +74,15 @@ def is_static(model: mujoco.MjModel) -> Array:
 
 def movable_kind(model: mujoco.MjModel) -> Array:
     """Return which geoms a slot of the ray model can stand for, (ngeom,) bool."""
-    return np.isin(model.geom_type, _KINDS)
+    movable = np.isin(model.geom_type, _KINDS)
+    is_mesh = model.geom_type == _MESH
+    if is_mesh.any():
+        try:
+            slot_model(model, [_MESH])
+        except ValueError:
+            # The compiler refuses these meshes, or makes something else of them.
+            movable &= ~is_mesh
+    return movable
 
 
 def static_geoms(model: mujoco.MjModel, data: mujoco.MjData, chosen: Array) -> StaticGeoms:
@@ -158,8 +167,33 @@ class TileTable:
 
 
 def slot_model(model: mujoco.MjModel, slot_types: list[int]) -> mujoco.MjModel:
-    """Compile a world of one placeholder geom for each slot, with the height fields of `model`."""
+    """Compile a world of one placeholder geom for each slot, with the surfaces of `model`.
+
+    Raises:
+        ValueError: a mesh of `model` cannot be compiled again.
+    """
     spec = mujoco.MjSpec()
+    if _HFIELD in slot_types:
+        _add_hfields(spec, model)
+    if _MESH in slot_types:
+        _add_meshes(spec, model)
+    for kind in slot_types:
+        geom = spec.worldbody.add_geom(type=_T(kind), size=[0.1, 0.1, 0.1])
+        if kind == _HFIELD:
+            geom.hfieldname = "field0"
+        elif kind == _MESH:
+            geom.meshname = "mesh0"
+    compiled = spec.compile()
+    # What the compiler centres and stretches is centred and stretched already; to the bit.
+    if _HFIELD in slot_types:
+        compiled.hfield_data[:] = model.hfield_data
+    if _MESH in slot_types:
+        _copy_meshes(model, compiled)
+    compiled.geom_sameframe[:] = 0
+    return compiled
+
+
+def _add_hfields(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     for i in range(model.nhfield):
         start, count = model.hfield_adr[i], model.hfield_nrow[i] * model.hfield_ncol[i]
         spec.add_hfield(
@@ -169,12 +203,29 @@ def slot_model(model: mujoco.MjModel, slot_types: list[int]) -> mujoco.MjModel:
             size=model.hfield_size[i],
             userdata=model.hfield_data[start : start + count],
         )
-    for kind in slot_types:
-        geom = spec.worldbody.add_geom(type=_T(kind), size=[0.1, 0.1, 0.1])
-        if kind == _HFIELD:
-            geom.hfieldname = "field0"
-    compiled = spec.compile()
-    # The compiler stretches elevations to the range 0 to 1, which these are in already; exactly.
-    compiled.hfield_data[:] = model.hfield_data
-    compiled.geom_sameframe[:] = 0
-    return compiled
+
+
+def _add_meshes(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    for i in range(model.nmesh):
+        vertices, faces = model.mesh_vertadr[i], model.mesh_faceadr[i]
+        spec.add_mesh(
+            name=f"mesh{i}",
+            uservert=model.mesh_vert[vertices : vertices + model.mesh_vertnum[i]].ravel(),
+            userface=model.mesh_face[faces : faces + model.mesh_facenum[i]].ravel(),
+            # An open mesh has no volume.
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+        )
+
+
+def _copy_meshes(source: mujoco.MjModel, target: mujoco.MjModel) -> None:
+    """Copy what rays read of meshes; ValueError if the two models have not the same meshes."""
+    for name in ("mesh_vertadr", "mesh_vertnum", "mesh_face", "mesh_bvhnum"):
+        if not np.array_equal(getattr(source, name), getattr(target, name)):
+            raise ValueError(f"{name} of a mesh has changed.")
+    target.mesh_vert[:] = source.mesh_vert
+    # The trees over the faces of each mesh stand between others.
+    for start, end, count in zip(
+        source.mesh_bvhadr, target.mesh_bvhadr, source.mesh_bvhnum, strict=True
+    ):
+        for name in ("bvh_child", "bvh_nodeid", "bvh_depth", "bvh_aabb"):
+            getattr(target, name)[end : end + count] = getattr(source, name)[start : start + count]

@@ -8,6 +8,7 @@ the few geoms that are near (`native_ray_nearby`). Their numbers are the same, h
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from functools import cached_property
 from typing import Any
 
 import mujoco
@@ -28,9 +29,12 @@ from mjlab.sim.engines.native_ray_tiles import (
 
 Array = np.ndarray
 MakeBatch = Callable[[mujoco.MjModel, int], Any]
+Poses = Callable[[], tuple[Array, Array]]
 
 # Fewer static geoms than this are tried faster than they are looked up.
 _MIN_GEOMS = 12
+# A first query of fewer trials (rays times geoms) is not worth a plan: it may be the only one.
+_MIN_TRIALS = 5_000_000
 # Windows that reach farther (metres) hold most of the geoms anyway. So many calls later, the rays
 # may be closer together.
 _MAX_MARGIN = 4.0
@@ -50,8 +54,15 @@ _STATIC_FIELDS = frozenset(
 class NativeRays:
     """Casts the rays of a native engine."""
 
-    def __init__(self, model: mujoco.MjModel, batch: Any, make_batch: MakeBatch) -> None:
-        """Cast in `batch`; `make_batch(model, count)` makes further batches."""
+    def __init__(
+        self, model: mujoco.MjModel, batch: Any, make_batch: MakeBatch, poses: Poses
+    ) -> None:
+        """Cast in `batch`.
+
+        `make_batch(model, count)` makes further batches, and `poses()` returns the current
+        positions (N, ngeom, 3) and orientations (N, ngeom, 3, 3) of the geoms.
+        """
+        self._poses = poses
         self._model, self._batch, self._make_batch = model, batch, make_batch
         self._host = mujoco.MjData(model)
         mujoco.mj_kinematics(model, self._host)
@@ -77,20 +88,42 @@ class NativeRays:
         rays = origins.shape[1]
         key = (geom_groups, rays, None if excluded is None else excluded.tobytes())
         if key not in self._plans:
-            self._plans[key] = _Plan(self._model, self._host, self._rule, geom_groups, excluded)
+            self._plans[key] = self._plan(geom_groups, excluded)
         plan = self._plans[key]
         hits = Hits.empty(len(origins), rays)
-        # A query that is made once is not worth a plan.
-        if plan.is_new or plan.nearby is None or not _STATIC_FIELDS.isdisjoint(expanded):
+        trials = origins.shape[0] * rays * self._model.ngeom
+        is_first, plan.is_new = plan.is_new and trials < _MIN_TRIALS, False
+        if is_first or plan.nearby is None or not _STATIC_FIELDS.isdisjoint(expanded):
             self._cast_all(plan, origins, directions, hits)
         else:
             self._cast_nearby(plan, origins, directions, max_distances, hits)
-        plan.is_new = False
         if max_distances is not None:
             too_far = hits.distances > max_distances.numpy()
             if too_far.any():
                 hits.forget(too_far)
         return hits
+
+    @cached_property
+    def _movable(self) -> Array:
+        return movable_kind(self._model)
+
+    def _plan(self, groups: tuple[int, ...] | None, excluded: Array | None) -> _Plan:
+        """Find out which geoms the rays can meet, and which of these are looked up by place."""
+        model = self._model
+        visible = visible_geoms(model, groups)
+        plan = _Plan(groups, excluded, is_one_sided=self._rule.concerns(visible))
+        near = visible & is_static(model)
+        if near.sum() < _MIN_GEOMS:
+            return plan
+        near &= self._movable
+        others = visible & ~near
+        plan.has_moving = bool(others.any())
+        # The others are cast without what MuJoCo counts as static, and no body is left out.
+        complete = not (others & is_welded(model)).any()
+        kept = excluded is None or not np.isin(model.geom_bodyid[near], excluded).any()
+        if complete and kept and near.sum() >= _MIN_GEOMS:
+            plan.nearby = static_geoms(model, self._host, near)
+        return plan
 
     def _cast_all(
         self,
@@ -103,8 +136,17 @@ class NativeRays:
     ) -> None:
         """Cast against the geoms of the model itself, in the environments `envs` (None: all)."""
 
+        poses = self._poses() if self._rule.fields_are_carried and plan.is_one_sided else None
+
         def passed(rows: Any, origins: Array, directions: Array, hits: Hits) -> Array:
-            return self._rule.passed(origins, directions, hits.distances, hits.normals, hits.geoms)
+            return self._rule.passed(
+                origins,
+                directions,
+                hits.distances,
+                hits.normals,
+                hits.geoms,
+                None if poses is None else (poses[0][rows], poses[1][rows]),
+            )
 
         cast_through(
             self._batch,
@@ -157,7 +199,8 @@ class NativeRays:
         excluded = np.full(len(limit), -1) if plan.excluded is None else plan.excluded
         _, sources = np.unique(np.stack((limit, excluded)), axis=1, return_inverse=True)
         ends = (origins + (directions * torch.from_numpy(limit)[:, None]).nan_to_num()).numpy()
-        starts = origins.numpy()
+        # An environment that has diverged says nothing about the others.
+        starts, ends = np.nan_to_num(origins.numpy()), np.nan_to_num(ends)
         classes = cluster_rays(starts[0], sources.reshape(-1))
         margins = [_margin(clusters, starts, ends) for clusters in classes]
         if len(margins) == len(plan.margins):
@@ -190,30 +233,17 @@ class _Plan:
     """How to cast rays against the geoms of some groups, as far as it is the same in every call."""
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        host: mujoco.MjData,
-        rule: CullingRule,
-        groups: tuple[int, ...] | None,
-        excluded: Array | None,
+        self, groups: tuple[int, ...] | None, excluded: Array | None, *, is_one_sided: bool
     ) -> None:
         self.mask = None
         if groups is not None:
             self.mask = np.zeros(6, dtype=np.uint8)
             self.mask[list(groups)] = 1
         self.excluded = excluded
-        visible = visible_geoms(model, groups)
-        self.is_one_sided = rule.concerns(visible)
+        self.is_one_sided = is_one_sided
         self.is_new = True
+        self.nearby: StaticGeoms | None = None
+        self.has_moving = False
         self.pause = 0
         self.parts: list[NearbyRays] = []
         self.margins: list[float] = []
-        near = visible & is_static(model) & movable_kind(model)
-        others = visible & ~near
-        self.has_moving = bool(others.any())
-        # The others are cast without what MuJoCo counts as static, and no body is left out.
-        complete = not (others & is_welded(model)).any()
-        kept = excluded is None or not np.isin(model.geom_bodyid[near], excluded).any()
-        self.nearby: StaticGeoms | None = None
-        if complete and kept and near.sum() >= _MIN_GEOMS:
-            self.nearby = static_geoms(model, host, near)

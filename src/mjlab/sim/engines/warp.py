@@ -9,6 +9,7 @@ The first use on a machine compiles the kernels (minutes); afterwards they come 
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -46,6 +47,8 @@ from mjlab.sim.engines.warp_support import (
 
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
+
+logger = logging.getLogger(__name__)
 
 # A type checker cannot follow how these two packages annotate their arrays.
 mjwarp: Any = mujoco_warp
@@ -143,7 +146,7 @@ class WarpEngine(Engine):
         limits = {"nconmax": cfg.nconmax, "njmax": cfg.njmax}
         try:
             self.wp_model = mjwarp.put_model(model)
-            self.wp_data = mjwarp.put_data(model, self._host, self.num_envs, **limits)
+            self.wp_data = mjwarp.put_data(model, self._placed(model, cfg), self.num_envs, **limits)
         except NotImplementedError as error:
             raise UnsupportedByWarpError(
                 f"The warp engine cannot simulate this model: {error} "
@@ -159,6 +162,27 @@ class WarpEngine(Engine):
         self.wp_model.opt.warn_overflow = 0
         if self._on_cuda:
             self.wp_model.opt.graph_conditional = wp.is_conditional_graph_supported()
+
+    def _placed(self, model: mujoco.MjModel, cfg: SimulationCfg) -> mujoco.MjData:
+        """Return the state to start from: that of `qpos0`, without contacts where they do not fit.
+
+        In the reference pose all robots are at the origin of the world, which may be deep inside a
+        generated terrain. Nobody starts an episode there, so that its contacts say nothing about
+        the sizes that are needed.
+        """
+        if cfg.nconmax is None or self._host.ncon <= cfg.nconmax:
+            return self._host
+        logger.warning(
+            "The reference pose has %d contacts, more than SimulationCfg.nconmax=%d. They are left "
+            "out until the first reset. If later poses have as many, set nconmax to that.",
+            self._host.ncon, cfg.nconmax,
+        )  # fmt: skip
+        free = mujoco.MjData(model)
+        flags = model.opt.disableflags
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        mujoco.mj_forward(model, free)
+        model.opt.disableflags = flags
+        return free
 
     # Order of work on the GPU.
 

@@ -126,6 +126,7 @@ def progress_html(title: str, stats: Stats | None, age: float) -> str:
         ("Policy", f"{age:.0f} s old"),
     ]
     lines = "".join(f"<div><strong>{row}:</strong> {value}</div>" for row, value in rows)
+    lines += '<div style="opacity:0.6">The view takes only the time that training leaves.</div>'
     return f'<div style="{style}">{name}{bar}{lines}</div>'
 
 

@@ -10,8 +10,11 @@ import torch
 from mjlab.actuator import (
     BuiltinDcMotorActuatorCfg,
     BuiltinMotorActuatorCfg,
+    BuiltinMuscleActuatorCfg,
     BuiltinPdActuatorCfg,
     BuiltinPositionActuatorCfg,
+    BuiltinVelocityActuatorCfg,
+    DcMotorActuatorCfg,
     DcMotorDatasheetParams,
     DcMotorInputMode,
     IdealPdActuatorCfg,
@@ -145,8 +148,68 @@ def test_kinds_without_gains_are_refused_by_name(make_world: Any) -> None:
     )
     with pytest.raises(TypeError, match=r"pd_gains: .*\['hip'\].*BuiltinMotorActuator"):
         world.apply(dr.pd_gains, kp_range=(1.0, 1.0), kd_range=(1.0, 1.0))
-    with pytest.raises(TypeError, match=r"effort_limits: .*\['hip'\].*BuiltinMotorActuator"):
-        world.apply(dr.effort_limits, effort_limit_range=(1.0, 1.0))
+
+
+MOTOR_PARAMS = DcMotorDatasheetParams(nominal_voltage=24.0, stall_torque=50.0, no_load_speed=30.0)
+HIP: dict[str, Any] = {"target_names_expr": ("hip",)}
+GAINS: dict[str, Any] = {**HIP, "stiffness": 8.0, "damping": 1.5}
+KINDS = {
+    "position": BuiltinPositionActuatorCfg(**GAINS, effort_limit=5.0),
+    "velocity": BuiltinVelocityActuatorCfg(**HIP, damping=1.5, effort_limit=5.0),
+    "motor": BuiltinMotorActuatorCfg(**HIP, effort_limit=5.0, gear=2.0),
+    "muscle": BuiltinMuscleActuatorCfg(**HIP, force=30.0, length_range=(-1.0, 1.0)),
+    "scaled muscle": BuiltinMuscleActuatorCfg(**HIP, length_range=(-1.0, 1.0)),
+    "pd": BuiltinPdActuatorCfg(**GAINS, effort_limit=5.0),
+    "dc motor": BuiltinDcMotorActuatorCfg(
+        **GAINS, motor_params=MOTOR_PARAMS, voltage_limit=24.0, effort_limit=5.0
+    ),
+    "voltage": BuiltinDcMotorActuatorCfg(
+        **HIP, motor_params=MOTOR_PARAMS, mode=DcMotorInputMode.VOLTAGE, effort_limit=5.0
+    ),
+    "ideal pd": IdealPdActuatorCfg(**GAINS, effort_limit=5.0),
+    "torque-speed curve": DcMotorActuatorCfg(
+        **GAINS, effort_limit=5.0, saturation_effort=50.0, velocity_limit=30.0
+    ),
+}
+WITHOUT_GAINS = ("motor", "muscle", "scaled muscle", "voltage")
+
+
+def hip_torque(world: Any, angle: float, speed: float, **targets: float) -> list[float]:
+    """Return the torque on the hip in the first two environments, for a state and targets."""
+    data = world.sim.data
+    data.qpos[:, 7], data.qvel[:, 6] = angle, speed
+    data.act[:] = 1.0
+    for name, value in targets.items():
+        getattr(world.robot.data, f"joint_{name}_target")[:] = value
+    world.robot.write_data_to_sim()
+    _ = data.qfrc_actuator
+    world.sim.forward()
+    return data.qfrc_actuator[:2, 6].tolist()
+
+
+@pytest.mark.parametrize("engine", ["native", "warp"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_gains_and_effort_limits_of_every_kind_act_on_the_joint(
+    make_world: Any, kind: str, engine: str
+) -> None:
+    world, chosen = make_world(actuators=(KINDS[kind],), engine=engine), torch.tensor([1])
+    most, limited = hip_torque(world, 0.0, 0.0, pos=90.0, vel=90.0, effort=90.0)
+    assert most == limited
+    world.apply(dr.effort_limits, chosen, effort_limit_range=(0.5, 0.5))
+    assert hip_torque(world, 0.0, 0.0) == pytest.approx([most, 0.5 * most], rel=1e-4)
+    if "muscle" not in kind:
+        gear = 2.0 if kind == "motor" else 1.0
+        world.apply(dr.effort_limits, chosen, effort_limit_range=(3.0, 3.0), operation="abs")
+        torques = hip_torque(world, 0.0, 0.0)
+        assert torques == pytest.approx([5.0 * gear, 3.0 * gear], rel=1e-4)
+    if kind in WITHOUT_GAINS:
+        return
+    world.apply(dr.pd_gains, chosen, kp_range=(2.0, 2.0), kd_range=(3.0, 3.0))
+    if kind != "velocity":
+        torques = hip_torque(world, 0.0, 0.0, pos=0.1, vel=0.0, effort=0.0)
+        assert torques == pytest.approx([0.8, 1.6], rel=1e-4)
+    torques = hip_torque(world, 0.0, 0.5, pos=0.0, vel=0.0, effort=0.0)
+    assert torques == pytest.approx([-0.75, -2.25], rel=1e-4)
 
 
 def test_only_scale_and_abs_are_known(make_world: Any) -> None:

@@ -12,8 +12,11 @@ import torch
 
 from mjlab.actuator import (
     BuiltinDcMotorActuator,
+    BuiltinMotorActuator,
+    BuiltinMuscleActuator,
     BuiltinPdActuator,
     BuiltinPositionActuator,
+    BuiltinVelocityActuator,
     DcMotorInputMode,
     IdealPdActuator,
     XmlActuator,
@@ -39,6 +42,7 @@ if TYPE_CHECKING:
     from mjlab.actuator import Actuator
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.managers.scene_entity_config import SceneEntityCfg
+    from mjlab.utils.mujoco import CommandField
 
 __getattr__ = older_names(__name__)
 
@@ -64,6 +68,10 @@ _SERVO_GAINS = Gains(
     kp=(Place("actuator_gainprm", 0, 1.0), Place("actuator_biasprm", 1, -1.0)),
     kd=(Place("actuator_biasprm", 2, -1.0),),
 )
+# A velocity servo has no stiffness.
+_VELOCITY_GAINS = Gains(
+    kp=(), kd=(Place("actuator_gainprm", 0, 1.0), Place("actuator_biasprm", 2, -1.0))
+)
 _DC_MOTOR_GAINS = Gains(
     kp=(Place("actuator_gainprm", 4, 1.0),), kd=(Place("actuator_gainprm", 6, 1.0),)
 )
@@ -79,6 +87,12 @@ def _range_of(field: str) -> tuple[Place, ...]:
 
 
 _FORCE_RANGE = _range_of("actuator_forcerange")
+_MOTOR_RANGES = (*_FORCE_RANGE, *_range_of("actuator_ctrlrange"))
+# The peak force of a muscle, and the figure from which MuJoCo takes it where it is negative. Both
+# stand twice, for the active and the passive force.
+_MUSCLE_FORCE = tuple(
+    Place(field, axis, 1.0) for field in ("actuator_gainprm", "actuator_biasprm") for axis in (2, 3)
+)
 
 
 @requires_model_fields("actuator_gainprm", "actuator_biasprm")
@@ -91,9 +105,9 @@ def pd_gains(
     distribution: Distribution | str = "uniform",
     operation: Operation | str = "scale",
 ) -> None:
-    """Randomize stiffness and damping of position-controlled actuators.
+    """Randomize stiffness and damping of actuators that have them.
 
-    Gains are drawn independently per environment and actuator: for each actuator config first all
+    Of velocity servos only the damping changes. Gains are drawn independently per environment and actuator: for each actuator config first all
     stiffnesses, then all dampings.
 
     Args:
@@ -106,7 +120,7 @@ def pd_gains(
 
     Raises:
         ValueError: another operation, or a DC motor that is driven by voltage.
-        TypeError: a selected actuator has no such gains.
+        TypeError: a selected actuator has no gains: motors and muscles have none.
     """
     dist, op = resolve_distribution(distribution), _scale_or_abs(operation, "pd_gains")
     bounds = read_bounds(kp_range, "kp_range"), read_bounds(kd_range, "kd_range")
@@ -123,7 +137,8 @@ def pd_gains(
 
 
 @requires_model_fields(
-    "actuator_forcerange", "actuator_ctrlrange", "jnt_actfrcrange", "tendon_actfrcrange"
+    *("actuator_forcerange", "actuator_ctrlrange", "jnt_actfrcrange", "tendon_actfrcrange"),
+    *("actuator_gainprm", "actuator_biasprm"),
 )
 def effort_limits(
     env: ManagerBasedRlEnv,
@@ -135,7 +150,8 @@ def effort_limits(
 ) -> None:
     """Randomize the largest effort of actuators, drawn per environment and actuator.
 
-    MuJoCo's own servos obey only if they were configured with an effort limit at all.
+    MuJoCo's own servos obey only if they were configured with an effort limit at all. The limit of
+    a motor holds before its gear; that of a muscle is its peak force.
 
     Args:
         env_ids: Environments to change; None means all.
@@ -146,7 +162,7 @@ def effort_limits(
 
     Raises:
         ValueError: another operation.
-        TypeError: a selected actuator is of a kind whose limit cannot be randomized.
+        TypeError: a selected actuator is of a user's own kind.
     """
     dist, op = resolve_distribution(distribution), _scale_or_abs(operation, "effort_limits")
     bounds = read_bounds(effort_limit_range, "effort_limit_range")
@@ -173,9 +189,15 @@ def _gain_places(actuator: Actuator) -> Gains | None:
                 "have no gains. Select other actuators, or use position or velocity mode."
             )
         return _DC_MOTOR_GAINS
-    if _is_servo(actuator):
+    if _reads(actuator, "position", BuiltinPositionActuator):
         return _SERVO_GAINS
-    raise TypeError(_refusal("pd_gains", actuator))
+    if _reads(actuator, "velocity", BuiltinVelocityActuator):
+        return _VELOCITY_GAINS
+    supported = (
+        "position and velocity servos (builtin or XML), BuiltinPdActuator, BuiltinDcMotorActuator, "
+        "IdealPdActuator and its subclasses"
+    )
+    raise TypeError(_refusal("pd_gains", actuator, supported))
 
 
 def _limit_places(selected: SelectedActuator) -> tuple[torch.Tensor, tuple[Place, ...]]:
@@ -189,25 +211,37 @@ def _limit_places(selected: SelectedActuator) -> tuple[torch.Tensor, tuple[Place
         if actuator.transmission_type == TransmissionType.JOINT:
             return indexing.joint_ids[targets].long(), _range_of("jnt_actfrcrange")
         return indexing.tendon_ids[targets].long(), _range_of("tendon_actfrcrange")
-    if isinstance(actuator, BuiltinDcMotorActuator) or _is_servo(actuator):
+    if isinstance(actuator, _FORCE_LIMITED):
         return elements, _FORCE_RANGE
-    raise TypeError(_refusal("effort_limits", actuator))
+    if isinstance(actuator, BuiltinMotorActuator):
+        return elements, _MOTOR_RANGES
+    if isinstance(actuator, BuiltinMuscleActuator):
+        return elements, _MUSCLE_FORCE
+    raise TypeError(_refusal("effort_limits", actuator, "every kind that mjlab.actuator has"))
 
 
-def _is_servo(actuator: Actuator) -> bool:
+_FORCE_LIMITED = (
+    BuiltinDcMotorActuator,
+    BuiltinPositionActuator,
+    BuiltinVelocityActuator,
+    XmlActuator,
+)
+
+
+def _reads(actuator: Actuator, command: CommandField, builtin: type[Actuator]) -> bool:
+    """Return whether it is a MuJoCo servo for this command, builtin or of the XML."""
     if isinstance(actuator, XmlActuator):
-        return actuator.command_field == "position"
-    return isinstance(actuator, BuiltinPositionActuator)
+        return actuator.command_field == command
+    return isinstance(actuator, builtin)
 
 
-def _refusal(function: str, actuator: Actuator) -> str:
+def _refusal(function: str, actuator: Actuator, supported: str) -> str:
     kind = type(actuator).__name__
     if isinstance(actuator, XmlActuator):
         kind += f" with command field {actuator.command_field!r}"
     return (
         f"{function}: the actuators {list(actuator.target_names)} are of kind {kind}, which it "
-        "cannot randomize. Supported: position actuators (builtin or XML), BuiltinPdActuator, "
-        "BuiltinDcMotorActuator, IdealPdActuator and its subclasses. Select others by name."
+        f"cannot randomize. Supported: {supported}. Select others by name."
     )
 
 

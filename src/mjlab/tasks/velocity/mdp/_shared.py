@@ -12,9 +12,16 @@ if TYPE_CHECKING:
     from mjlab.managers.scene_entity_config import SceneEntityCfg
 
 
+def velocity_command(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
+    """Return a velocity command (vx, vy, wz) in the frame of the root, (N, 3)."""
+    # That it exists was checked when the term was built.
+    manager: Any = env.command_manager
+    return manager.get_command(command_name)
+
+
 def command_speed(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     """Return `|c_xy| + |c_z|` of a velocity command, (N,): how much motion is asked for."""
-    command = env.command_manager.get_command(command_name)
+    command = velocity_command(env, command_name)
     return torch.linalg.vector_norm(command[:, :2], dim=1).add_(command[:, 2].abs())
 
 

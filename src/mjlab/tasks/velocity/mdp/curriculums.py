@@ -10,15 +10,16 @@ import torch
 from mjlab.compat import older_names
 from mjlab.managers.build_checks import checked_when_built
 from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.tasks.velocity.mdp._shared import velocity_command
+from mjlab.tasks.velocity.mdp.command_checks import RANGES, check_range
 from mjlab.tasks.velocity.mdp.sensor_checks import nearest, require_command
-from mjlab.tasks.velocity.mdp.velocity_command import UniformVelocityCommand, check_range
+from mjlab.tasks.velocity.mdp.velocity_command import UniformVelocityCommand
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
 
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
-_RANGES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 
 __getattr__ = older_names(__name__)
 
@@ -89,18 +90,16 @@ def _move(
     use_elapsed_time: bool,
 ) -> None:
     asset: Entity = env.scene[asset_cfg.name]
-    terrain = env.scene.terrain
-    assert terrain is not None
+    terrain: Any = env.scene.terrain
     offset = asset.data.root_link_pos_w[env_ids, :2] - env.scene.env_origins[env_ids, :2]
     distance = torch.linalg.vector_norm(offset, dim=1)
-    command = env.command_manager.get_command(command_name)[env_ids]
+    command = velocity_command(env, command_name)[env_ids]
     duration: torch.Tensor | float = env.max_episode_length_s
     if use_elapsed_time:
         term: Any = env.command_manager.get_term(command_name)
         duration = term.elapsed_s[env_ids]
     asked = torch.linalg.vector_norm(command[:, :2], dim=1) * duration * 0.5
-    generator = terrain.cfg.terrain_generator
-    move_up = distance > generator.size[0] / 2.0
+    move_up = distance > terrain.cfg.terrain_generator.size[0] / 2.0
     move_down = (distance < asked) & ~move_up
     # At the first reset robots are wherever the model puts them.
     has_moved = env.episode_length_buf[env_ids] > (0 if env.common_step_counter > 0 else torch.inf)
@@ -133,10 +132,10 @@ def _check_stages(
         if "step" not in stage:
             raise ValueError(f"velocity_stages: the stage {dict(stage)} has no 'step'.")
         for key, bounds in stage.items():
-            if key != "step" and key not in _RANGES:
+            if key != "step" and key not in RANGES:
                 raise ValueError(
                     f"velocity_stages: the stage of step {stage['step']} has {key!r}. "
-                    f"{nearest(key, _RANGES)}"
+                    f"{nearest(key, RANGES)}"
                 )
             if key != "step" and bounds is not None:
                 check_range(f"velocity_stages: {key} of the stage of step {stage['step']}", bounds)
@@ -166,12 +165,12 @@ def commands_vel(
     ranges: Any = env.command_manager.get_term_cfg(command_name).ranges  # ty: ignore
     for stage in velocity_stages:
         if env.common_step_counter >= stage["step"]:
-            for name in _RANGES:
+            for name in RANGES:
                 bounds = stage.get(name)
                 if bounds is not None:
                     setattr(ranges, name, tuple(bounds))
     return {
         f"{name}_{end}": torch.tensor(float(bound))
-        for name in _RANGES
+        for name in RANGES
         for end, bound in zip(("min", "max"), getattr(ranges, name), strict=True)
     }

@@ -22,6 +22,7 @@ from mjlab.tasks.velocity.mdp._shared import (
     masked_mean,
     single_body,
     tilt_of,
+    velocity_command,
 )
 from mjlab.tasks.velocity.mdp.feet_rewards import feet_air_time as feet_air_time
 from mjlab.tasks.velocity.mdp.feet_rewards import feet_clearance as feet_clearance
@@ -69,7 +70,7 @@ def track_linear_velocity(
     with v the velocity of the root link in its own frame (m/s).
     """
     asset: Entity = env.scene[asset_cfg.name]
-    command = env.command_manager.get_command(command_name)
+    command = velocity_command(env, command_name)
     error = asset.data.root_link_lin_vel_b.clone()
     error[:, :2] -= command[:, :2]
     return torch.exp(error.square().sum(dim=1) / -(std**2))
@@ -90,7 +91,7 @@ def track_angular_velocity(
     keep a heading, c_z is the yaw rate that heading control asks for.
     """
     asset: Entity = env.scene[asset_cfg.name]
-    command = env.command_manager.get_command(command_name)
+    command = velocity_command(env, command_name)
     error = asset.data.root_link_ang_vel_b.clone()
     error[:, 2] -= command[:, 2]
     return torch.exp(error.square().sum(dim=1) / -(std**2))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ import torch
 
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.env_ids import as_ids, is_empty
+from mjlab.tasks.velocity.mdp.command_checks import RANGES, check_command_cfg
 from mjlab.tasks.velocity.mdp.velocity_arrows import draw_velocity_arrows
 from mjlab.tasks.velocity.mdp.velocity_joystick import VelocityJoystick
 from mjlab.utils.lab_api.math import quat_apply, wrap_to_pi
@@ -23,14 +23,6 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.viewer.debug_visualizer import DebugVisualizer
 
-_LINEAR_AND_YAW = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
-_PROBABILITIES = (
-    "rel_standing_envs",
-    "rel_heading_envs",
-    "rel_world_envs",
-    "rel_forward_envs",
-    "init_velocity_prob",
-)
 _MIN_FORWARD_SPEED = 0.3
 """Least speed that environments which only go forward are asked for, in m/s."""
 
@@ -124,7 +116,7 @@ class UniformVelocityCommand(CommandTerm):
     def __init__(self, cfg: UniformVelocityCommandCfg, env: ManagerBasedRlEnv) -> None:
         # The ranges change at run time, so that they are the term's own.
         super().__init__(dataclasses.replace(cfg, ranges=dataclasses.replace(cfg.ranges)), env)
-        _check_cfg(cfg)
+        check_command_cfg(cfg)
         if cfg.entity_name not in env.scene.entities:
             raise ValueError(
                 f"entity_name is {cfg.entity_name!r}, but the scene's entities are "
@@ -217,7 +209,7 @@ class UniformVelocityCommand(CommandTerm):
         cfg = self.cfg
         # One draw for all numbers, a row each, in the order in which rows are taken.
         rows = iter(torch.rand(8 if cfg.heading_command else 6, len(env_ids), device=self.device))
-        ranges = [getattr(cfg.ranges, name) for name in _LINEAR_AND_YAW]
+        ranges = [getattr(cfg.ranges, name) for name in RANGES]
         command = torch.stack([_scaled(next(rows), bounds) for bounds in ranges], dim=1)
         if cfg.heading_command:
             self.heading_target[env_ids] = _scaled(next(rows), cfg.ranges.heading or (0.0, 0.0))
@@ -320,37 +312,3 @@ def _rotated(vector: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
     cos, sin = torch.cos(angle), torch.sin(angle)
     x, y = vector[:, 0], vector[:, 1]
     return torch.stack((cos * x - sin * y, sin * x + cos * y), dim=1)
-
-
-def check_range(label: str, bounds: Any) -> None:
-    """Raise `ValueError` unless `bounds` are two finite numbers, the smaller one first."""
-    try:
-        low, high = (float(bound) for bound in bounds)
-    except (TypeError, ValueError):
-        low, high = math.nan, math.nan
-    if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-        turned = " They are the wrong way round." if low > high else ""
-        raise ValueError(
-            f"{label} is {bounds!r}; it has to be two finite numbers, the smaller one first.{turned}"
-        )
-
-
-def _check_cfg(cfg: UniformVelocityCommandCfg) -> None:
-    for name in _LINEAR_AND_YAW:
-        check_range(f"ranges.{name}", getattr(cfg.ranges, name))
-    if cfg.heading_command and cfg.ranges.heading is None:
-        raise ValueError("heading_command is True, but ranges.heading is None. Give the range.")
-    if not cfg.heading_command and cfg.ranges.heading is not None:
-        raise ValueError(
-            f"ranges.heading is {cfg.ranges.heading}, but heading_command is False, so that no "
-            "heading is ever commanded. Set heading_command=True, or ranges.heading=None."
-        )
-    if cfg.ranges.heading is not None:
-        check_range("ranges.heading", cfg.ranges.heading)
-    for name in _PROBABILITIES:
-        if not 0.0 <= getattr(cfg, name) <= 1.0:
-            raise ValueError(f"{name} is {getattr(cfg, name)!r}; a share is between 0 and 1.")
-    if min(cfg.resampling_time_range) < 0.0:
-        raise ValueError(
-            f"resampling_time_range is {cfg.resampling_time_range}; times cannot be negative."
-        )

@@ -1,0 +1,50 @@
+"""What a velocity command refuses when it is built."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mjlab.tasks.velocity.mdp.velocity_command import UniformVelocityCommandCfg
+
+RANGES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
+"""The ranges that every velocity command has."""
+_PROBABILITIES = (
+    "rel_standing_envs",
+    "rel_heading_envs",
+    "rel_world_envs",
+    "rel_forward_envs",
+    "init_velocity_prob",
+)
+
+
+def check_range(label: str, bounds: Any) -> None:
+    """Raise `ValueError` unless `bounds` are two finite numbers, the smaller one first."""
+    try:
+        low, high = (float(bound) for bound in bounds)
+    except (TypeError, ValueError):
+        low, high = math.nan, math.nan
+    if not (math.isfinite(low) and math.isfinite(high) and low <= high):
+        turned = " They are the wrong way round." if low > high else ""
+        raise ValueError(
+            f"{label} is {bounds!r}; it has to be two finite numbers, the smaller one first.{turned}"
+        )
+
+
+def check_command_cfg(cfg: UniformVelocityCommandCfg) -> None:
+    """Raise `ValueError` for ranges, shares or a heading that make no sense."""
+    for name in RANGES:
+        check_range(f"ranges.{name}", getattr(cfg.ranges, name))
+    if cfg.heading_command and cfg.ranges.heading is None:
+        raise ValueError("heading_command is True, but ranges.heading is None. Give the range.")
+    if not cfg.heading_command and cfg.ranges.heading is not None:
+        raise ValueError(
+            f"ranges.heading is {cfg.ranges.heading}, but heading_command is False, so that no "
+            "heading is ever commanded. Set heading_command=True, or ranges.heading=None."
+        )
+    if cfg.ranges.heading is not None:
+        check_range("ranges.heading", cfg.ranges.heading)
+    for name in _PROBABILITIES:
+        if not 0.0 <= getattr(cfg, name) <= 1.0:
+            raise ValueError(f"{name} is {getattr(cfg, name)!r}; a share is between 0 and 1.")
