@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -19,6 +19,7 @@ from mjlab.actuator import (
     BuiltinPdActuatorCfg,
     BuiltinPositionActuatorCfg,
     BuiltinVelocityActuatorCfg,
+    DcMotorActuatorCfg,
     DcMotorDatasheetParams,
     IdealPdActuatorCfg,
     TransmissionType,
@@ -234,6 +235,43 @@ def test_a_fixed_lag_returns_the_command_of_that_many_writes_ago(make_world):
     values = [write(world, float(k))[0] for k in range(1, 7)]
     # The first command fills the line.
     assert values == [1.0, 1.0, 1.0, 2.0, 3.0, 4.0]
+
+
+NO_LAG = {"delay_min_lag": 0, "delay_max_lag": 0}
+FIXED_LAG = {"delay_min_lag": 2, "delay_max_lag": 2}
+ALL_JOINTS: dict[str, Any] = {"target_names_expr": ("hip", "knee", "ankle"), **FIXED_LAG}
+DELAYED = {
+    "position": BuiltinPositionActuatorCfg(**ALL_JOINTS, stiffness=2.0, damping=0.0),
+    "velocity": BuiltinVelocityActuatorCfg(**ALL_JOINTS, damping=3.0),
+    "motor": BuiltinMotorActuatorCfg(**ALL_JOINTS, effort_limit=1e6),
+    "native pd": BuiltinPdActuatorCfg(**ALL_JOINTS, stiffness=2.0, damping=3.0),
+    "ideal pd": IdealPdActuatorCfg(**ALL_JOINTS, stiffness=2.0, damping=3.0),
+    "dc motor": DcMotorActuatorCfg(
+        **ALL_JOINTS, stiffness=2.0, damping=3.0, effort_limit=1e6, saturation_effort=1e6,
+        velocity_limit=1e6,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", DELAYED)
+def test_a_delay_holds_back_every_target_and_every_command_of_it(make_world, kind):
+    """Each of three joints gets what it alone was told, and every part of it two writes late."""
+    now, late = (
+        make_world(cfg) for cfg in (replace(DELAYED[kind], **NO_LAG), DELAYED[kind])
+    )  # fmt: skip
+    forces = {"now": [], "late": []}
+    for k in range(7):
+        generator = torch.Generator().manual_seed(k)
+        commands = torch.randn(3, 3, 3, generator=generator)
+        for world, told in ((now, forces["now"]), (late, forces["late"])):
+            data = world.entity.data
+            data.joint_pos_target[:], data.joint_vel_target[:] = commands[0], commands[1]
+            data.joint_effort_target[:] = commands[2]
+            world.force()
+            told.append(world.sim.data.qfrc_actuator.clone())
+    for k in range(2, 7):
+        torch.testing.assert_close(forces["late"][k], forces["now"][k - 2])
+    assert len(forces["now"][3].unique()) == 9
 
 
 def test_position_velocity_and_effort_of_a_command_are_of_the_same_age():

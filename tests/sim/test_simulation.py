@@ -258,6 +258,20 @@ def test_a_moved_centre_of_mass_acts_as_if_compiled_so():
     np.testing.assert_allclose(sim.data.qpos[2], data.qpos, atol=1e-5)
 
 
+@pytest.mark.parametrize("field", ["geom_pos", "site_pos", "body_ipos"])
+def test_frames_can_be_moved_after_constants_were_recomputed(field):
+    """mj_setConst marks frames that coincide, and MuJoCo then skips what is between them."""
+    xml = """<mujoco><worldbody><body name="b"><joint axis="0 1 0"/><geom size=".1"/>
+      <site name="s"/></body></worldbody></mujoco>"""
+    sim = Simulation(2, SimulationCfg(), spec=mujoco.MjSpec.from_string(xml), device="cpu")
+    place = {"geom_pos": "geom_xpos", "site_pos": "site_xpos", "body_ipos": "xipos"}[field]
+    sim.expand_model_fields((field, "body_mass"))
+    sim.recompute_constants(3)
+    getattr(sim.model, field)[1, -1] = torch.tensor([0.1, 0.2, 0.3])
+    sim.forward()
+    assert getattr(sim.data, place)[:, -1].tolist() == [[0.0] * 3, pytest.approx([0.1, 0.2, 0.3])]
+
+
 def test_a_resumed_simulation_continues_bit_for_bit():
     straight = make_sim()
     straight.expand_model_fields(("geom_friction",))

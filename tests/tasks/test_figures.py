@@ -20,8 +20,13 @@ DEVIATIONS: dict[str, set[str]] = {
     }
     for task in ("Mjlab-Cartpole-Balance", "Mjlab-Cartpole-Swingup")
 }
-# Sensors of collisions report the strongest contact, where the tables have them report any.
+# What evaluations measure is ours, too. Sensors of collisions report the strongest contact, where
+# the tables have them report any.
+_TRACKING_ERRORS = {
+    name: f"tasks.velocity.tracking_errors:{name}" for name in ("lin_vel_error", "ang_vel_error")
+}
 for task, positions in {
+    "Mjlab-Velocity-Flat-Unitree-Go1": [],
     "Mjlab-Velocity-Flat-Unitree-G1": [2],
     "Mjlab-Velocity-Rough-Unitree-G1": [3],
     "Mjlab-Velocity-Rough-Unitree-Go1": [3, 4, 5, 6],
@@ -29,6 +34,9 @@ for task, positions in {
     DEVIATIONS[task] = {
         f"env.scene.sensors[{position}].reduce is 'none' in the table, and default here"
         for position in positions
+    } | {
+        "rl.evaluation is default in the table, and "
+        f"{ {'_': 'EvaluationCfg', 'metrics': _TRACKING_ERRORS}!r} here"
     }
 
 

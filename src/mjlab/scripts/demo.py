@@ -30,9 +30,15 @@ def demo_cfg() -> PlayConfig:
     """Return what `demo` plays unless flags say otherwise: one robot, on the CPU, in the browser."""
     from mjlab.scripts.play_run import PlayConfig
     from mjlab.scripts.policy import policy_env_cfg
+    from mjlab.sensor import RayCastSensorCfg
 
+    env = policy_env_cfg(TASK, None, play=True)
+    for sensor in env.scene.sensors:
+        # A first look is at the robot, not at what its sensors see.
+        if isinstance(sensor, RayCastSensorCfg):
+            sensor.debug_vis = False
     return PlayConfig(
-        env=policy_env_cfg(TASK, None, play=True),
+        env=env,
         checkpoint_file=str(POLICY),
         num_envs=1,
         device="cpu",

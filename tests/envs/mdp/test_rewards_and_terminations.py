@@ -127,6 +127,19 @@ def test_tilt_of_the_root(make_world: Any) -> None:
     assert low.tolist() == [True, True, False, False]
 
 
+def test_a_tilt_beyond_what_acos_takes_is_no_nan() -> None:
+    """Rounding makes the cosine of an upright or overturned root slightly more than one."""
+    down = torch.tensor([[0.0, 0.0, -1.0000002], [0.0, 0.0, 1.0000002], [0.0, 0.6, -0.8]])
+    assert torch.acos(-down[:2, 2]).isnan().all()
+    data = SimpleNamespace(projected_gravity_b=down.clone())
+    env: Any = SimpleNamespace(scene={"robot": SimpleNamespace(data=data)})
+    overturned = terminations.bad_orientation(env, limit_angle=3.0)
+    assert overturned.tolist() == [False, True, False]
+    assert terminations.bad_orientation(env, limit_angle=0.5).tolist() == [False, True, True]
+    # The observation is not clamped on the way.
+    assert torch.equal(data.projected_gravity_b, down)
+
+
 def test_time_out_is_reached_at_the_maximum_length(make_world: Any) -> None:
     world = make_world()
     world.episode_length_buf[:] = torch.tensor([0, 9, 10, 11])

@@ -91,6 +91,7 @@ class NativeEngine(Engine):
         self._tensors: dict[str, torch.Tensor] = {}
         self._model_arrays: dict[str, np.ndarray] = {}
         self._model_tensors: dict[str, torch.Tensor] = {}
+        self._frame_marks: list[np.ndarray] = []
         self._midphase: MidphaseMargins | None = None
         for name in _ALWAYS_BOUND:
             self._bind(name)
@@ -168,6 +169,7 @@ class NativeEngine(Engine):
                 if mark not in self._model_arrays:
                     self._model_arrays[mark] = self._batch.expand(mark)
                     self._model_arrays[mark][:] = 0
+                    self._frame_marks.append(self._model_arrays[mark])
             array = _as_float32(self._batch.expand, name, "MjModel")
             self._model_arrays[name] = array
             # Whether a tensor made in inference mode was written cannot be seen afterwards.
@@ -250,6 +252,9 @@ class NativeEngine(Engine):
         # mj_setConst does both parts at once; the part not asked for comes out as it was.
         self.expand(self.constants_written_by(level))
         self._batch.set_const(_as_ids(env_ids))
+        # It also marks anew which frames coincide now, and these may be moved apart after it.
+        for mark in self._frame_marks:
+            mark[:] = 0
 
     # Queries.
 

@@ -9,7 +9,9 @@ import mujoco
 import pytest
 import torch
 
-from mjlab.envs.mdp import dr
+from mjlab.actuator import BuiltinPositionActuatorCfg
+from mjlab.envs.mdp import dr, observations
+from mjlab.envs.mdp.actions import JointPositionActionCfg
 from mjlab.envs.mdp.dr._hooks import normalize_ball_joints
 from mjlab.envs.mdp.dr._selection import DOF, QPOS, Selection, select
 from mjlab.managers.scene_entity_config import SceneEntityCfg
@@ -58,6 +60,34 @@ def test_geom_size_with_patterns_leaves_other_geoms_alone(make_world: Any) -> No
     world.apply(dr.geom_size, ranges={"sphere": (3.0, 3.0)})
     assert world.sim.model.geom_rbound[0, 1] == pytest.approx(0.3)
     assert world.sim.model.geom_rbound[0, 0] == pytest.approx(world.sim.mj_model.geom_rbound[0])
+
+
+def test_geom_size_bounds_are_those_of_their_own_environment_and_geom(make_world: Any) -> None:
+    """More geoms than environments, of types in turn, and a part of both: no grid fits by luck."""
+    xml = (
+        """<mujoco><worldbody><body name="b"><freejoint/>"""
+        + "".join(
+            f'<geom name="{kind}{k}" type="{kind}" size=".1 .2 .3"/>'
+            for k in range(2)
+            for kind in PRIMITIVES
+        )
+        + "</body></worldbody></mujoco>"
+    )
+    world = make_world(xml, num_envs=5)
+    model, envs = world.sim.model, torch.tensor([1, 3, 4])
+    chosen = SceneEntityCfg("robot", geom_names=("sphere.", "box1", "capsule.", "ellipsoid0"))
+    world.apply(dr.geom_size, envs, ranges=(0.5, 2.0), asset_cfg=chosen)
+    changed = model.geom_size != world.sim.get_default_field("geom_size")
+    assert changed.any(dim=2).sum(dim=1).tolist() == [0, 6, 0, 6, 6]
+    for env in range(5):
+        spec = mujoco.MjSpec.from_string(xml)
+        for geom in range(10):
+            spec.geoms[geom].size = model.geom_size[env, geom].double()
+        built = spec.compile()
+        for field in ("geom_rbound", "geom_aabb"):
+            expected = torch.as_tensor(getattr(built, field)).float()
+            now = getattr(model, field)[env].reshape(expected.shape)
+            torch.testing.assert_close(now, expected, msg=f"{field} of environment {env}")
 
 
 # joint_limits
@@ -170,6 +200,31 @@ def test_joint_default_pos_shifts_the_zero_and_keeps_the_defaults(make_world: An
 
 
 # encoder_bias
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_encoder_bias_is_seen_by_actions_and_by_observations_alike(
+    make_world: Any, engine: str
+) -> None:
+    """A robot that has reached its target senses the position that it was told, bias or not."""
+    servo = BuiltinPositionActuatorCfg(target_names_expr=(".*",), stiffness=5e3, damping=50.0)
+    world = make_world(engine=engine, actuators=(servo,))
+    world.apply(dr.encoder_bias, bias_range=(-0.2, 0.2))
+    bias = world.robot.data.encoder_bias
+    assert len(bias.unique()) == bias.numel()
+    world.robot.data.default_joint_pos[:] = torch.tensor([0.1, -0.2, 0.05])
+    cfg = JointPositionActionCfg(entity_name="robot", actuator_names=(".*",), scale=0.5)
+    term, action = cfg.build(world), torch.tensor([[0.2, -0.1, 0.3]]).expand(4, 3)
+    term.process_actions(action)
+    for _ in range(100):
+        term.apply_actions()
+        world.robot.write_data_to_sim()
+        world.sim.step()
+    sensed = observations.joint_pos_rel(world, biased=True)
+    torch.testing.assert_close(sensed, 0.5 * action, atol=5e-3, rtol=0)
+    # The joints themselves are elsewhere, by the bias.
+    true = observations.joint_pos_rel(world)
+    torch.testing.assert_close(true, 0.5 * action - bias, atol=5e-3, rtol=0)
 
 
 def test_encoder_bias_is_replaced_and_survives_resets(make_world: Any) -> None:

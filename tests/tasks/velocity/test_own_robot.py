@@ -1,0 +1,57 @@
+"""The example of the documentation: the task for a robot of one's own."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+
+from mjlab.asset_zoo.robots import get_go1_robot_cfg
+from mjlab.envs import ManagerBasedRlEnv
+
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "velocity.md"
+
+
+@pytest.fixture
+def example(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Run the code of the page; the Go1 stands for one's own robot."""
+    robots: Any = ModuleType("my_robots")
+    robots.FEET, robots.TRUNK = ("FR", "FL", "RR", "RL"), "trunk"
+    robots.get_my_robot_cfg = get_go1_robot_cfg
+    monkeypatch.setitem(sys.modules, "my_robots", robots)
+    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    assert len(blocks) == 2
+    namespace: dict[str, Any] = {}
+    for block in blocks:
+        exec(block, namespace)
+    return namespace
+
+
+@pytest.mark.parametrize("play", [False, True])
+@pytest.mark.parametrize("name", ["my_robot_env_cfg", "my_robot_flat_env_cfg"])
+def test_the_example_builds_and_steps(example, name, play):
+    cfg = example[name](play=play)
+    cfg.scene.num_envs, cfg.seed, cfg.sim.engine = 2, 1, "native"
+    if cfg.scene.terrain.terrain_generator:
+        cfg.scene.terrain.terrain_generator.num_rows = 2
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    env.reset()
+    reward = env.step(torch.zeros(2, 12))[1]
+    assert torch.isfinite(reward).all()
+    assert (reward > 0.0).all()
+    env.close()
+
+
+def test_the_snippet_about_the_elapsed_time_sets_a_parameter_that_exists(example, make_env):
+    term = example["cfg"].curriculum["terrain_levels"]
+
+    def edit(cfg):
+        cfg.curriculum["terrain_levels"] = term
+
+    env = make_env("Mjlab-Velocity-Rough-Unitree-Go1", edit=edit, num_envs=2)
+    assert env.curriculum_manager.get_term_cfg("terrain_levels").params["use_elapsed_time"]
