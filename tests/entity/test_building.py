@@ -89,7 +89,11 @@ IN_XML = '<actuator><motor name="drive" joint="knee"/></actuator></mujoco>'
         ((SERVO, MOTOR), False, r"MotorActuatorCfg.*'knee' has one by BuiltinPositionActuatorCfg"),
         ((SERVO, SERVO), False, r"'hip' has one .*, 'knee' has one "),
         ((SERVO,), True, r"'knee' has the actuator 'drive' of the XML.*XmlActuatorCfg"),
-        ((XmlActuatorCfg(target_names_expr=("knee",)), MOTOR), True, "'knee' has the actuator 'drive'"),
+        (
+            (XmlActuatorCfg(target_names_expr=("knee",)), MOTOR),
+            True,
+            "'knee' has the actuator 'drive'",
+        ),
         ((XmlActuatorCfg(target_names_expr=("knee",)),) * 2, True, "'knee' has one by XmlActuator"),
     ],
 )

@@ -53,9 +53,11 @@ class FakeSim:
 
     def __init__(self) -> None:
         self.recomputed: list[int] = []
+        self.recomputed_for: list[Any] = []
 
-    def recompute_constants(self, level: int) -> None:
+    def recompute_constants(self, level: int, env_ids: Any = None) -> None:
         self.recomputed.append(level)
+        self.recomputed_for.append(env_ids)
 
 
 class FakeEnv:

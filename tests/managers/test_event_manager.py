@@ -173,6 +173,18 @@ def test_levels_of_fired_events_are_joined_and_recomputed_once(make_env, levels)
     assert env.sim.recomputed == expected[bool(fixed), bool(at_qpos0)]
 
 
+def test_after_a_reset_constants_are_recomputed_where_it_was(make_env):
+    env = make_env()
+    mass = changing(RecomputeLevel.set_const, "body_mass")
+    events = {mode: EventTermCfg(func=mass, mode=mode) for mode in ("startup", "reset")}
+    manager = EventManager(events, env)
+    manager.apply("startup")
+    manager.apply("reset", env_ids=torch.tensor([1]), global_env_step_count=0)
+    everywhere, where_reset = env.sim.recomputed_for
+    assert everywhere is None
+    assert where_reset.tolist() == [1]
+
+
 def test_events_that_did_not_fire_recompute_nothing(env):
     cfg = EventTermCfg(
         func=changing(RecomputeLevel.set_const), mode="interval", interval_range_s=(1.0, 1.0)

@@ -66,3 +66,13 @@ def test_rates_are_averages_over_half_a_second() -> None:
     assert meter.frames_per_second == pytest.approx(10.0)
     meter.update(1.0)
     assert meter.steps_per_second == 0.0
+
+
+def test_the_next_step_is_due_when_the_budget_has_grown_to_it() -> None:
+    pacer = RealtimePacer(step_dt=0.02, frame_period=0.1)
+    pacer.add(0.005)
+    assert pacer.time_to_next_step == pytest.approx(0.015)
+    pacer.change_speed(+1)
+    assert pacer.time_to_next_step == pytest.approx(0.0075)
+    pacer.add(1.0)
+    assert pacer.time_to_next_step == 0.0

@@ -136,6 +136,31 @@ def test_controls_only_ask_for_a_redraw_and_never_draw_themselves(viser_server) 
     assert drawn
 
 
+def test_each_sensor_that_draws_has_a_switch(viser_server) -> None:
+    viewer = make(viser_server)
+    show(viewer)
+    hits = next(box for box in checkboxes(viser_server) if box.label == "hits")
+    assert hits.value
+    assert not any(box.label == "silent" for box in checkboxes(viser_server))
+    spheres = viewer.scene.debug._handles["sphere"]
+    assert len(spheres.batched_positions) == 2
+    hits.value = False
+    assert viewer.scene.redraw_requested
+    show(viewer)
+    assert len(spheres.batched_positions) == 1
+
+
+def checkboxes(server) -> list:
+    handles = server.gui._gui_input_handle_from_uuid.values()
+    return [handle for handle in handles if type(handle).__name__ == "GuiCheckboxHandle"]
+
+
+def test_contact_points_are_wider_than_mjviser_draws_them(viser_server) -> None:
+    viewer = make(viser_server)
+    authored = viewer.env.sim.mj_model.vis.scale.contactwidth
+    assert viewer.scene.mj_model.vis.scale.contactwidth > 2 * authored
+
+
 def test_commands_hear_of_pauses_and_gui_resets(viser_server) -> None:
     viewer = make(viser_server)
     viewer.scene.env_idx = 1

@@ -137,7 +137,9 @@ class FakeEnv:
         self.metrics_manager = FakeTerms({"height": 1.0})
         self.command_manager = FakeTerms({"velocity": 0.0})
         self.manager_visualizers = {"command_manager": self.command_manager}
-        self.sensor_visualizers = SensorSwitches({"hits": FakeSensor(), "silent": FakeSensor(False)})
+        self.sensor_visualizers = SensorSwitches(
+            {"hits": FakeSensor(), "silent": FakeSensor(False)}
+        )
         self.metadata = {"render_fps": 50.0}
         self.num_steps = 0
         self.num_resets = 0

@@ -103,6 +103,9 @@ class EventManager(TermFunctionSwitches, TermListManager):
     ) -> None:
         """Let the events of a mode happen where they are due, then recompute what they changed.
 
+        After resets, constants are recomputed for the environments that were reset only: on the
+        native engine that costs more than a substep for each.
+
         Args:
             mode: One of "startup", "reset", "interval" and "step".
             env_ids: Environments that reset; required for "reset", refused for "interval".
@@ -112,12 +115,14 @@ class EventManager(TermFunctionSwitches, TermListManager):
         Raises `ValueError` if an argument is missing or out of place, or the mode is unknown.
         """
         _check_arguments(mode, env_ids, dt, global_env_step_count)
-        levels = []
+        levels, reset_ids = [], None
+        if mode == "reset":
+            reset_ids = as_ids(env_ids, self.num_envs, self.device)
         for name, cfg in self._terms_by_mode.get(mode, ()):
             if mode == "interval":
                 fired = self._apply_interval(name, cfg, dt or 0.0)
-            elif mode == "reset":
-                fired = self._apply_reset(name, cfg, env_ids, global_env_step_count or 0)
+            elif reset_ids is not None:
+                fired = self._apply_reset(name, cfg, reset_ids, global_env_step_count or 0)
             else:
                 cfg.func(self._env, env_ids, **cfg.params)
                 fired = True
@@ -125,7 +130,7 @@ class EventManager(TermFunctionSwitches, TermListManager):
                 levels.append(declared_recompute(cfg.func, cfg.params))
         level = join_levels(levels)
         if level != RecomputeLevel.none:
-            self._env.sim.recompute_constants(level)
+            self._env.sim.recompute_constants(level, reset_ids)
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
         """Reset terms of all modes and redraw the timers of these environments; logs nothing."""
@@ -155,10 +160,7 @@ class EventManager(TermFunctionSwitches, TermListManager):
         cfg.func(self._env, ids, **cfg.params)
         return True
 
-    def _apply_reset(
-        self, name: str, cfg: EventTermCfg, env_ids: torch.Tensor | slice | None, step: int
-    ) -> bool:
-        ids = as_ids(env_ids, self.num_envs, self.device)
+    def _apply_reset(self, name: str, cfg: EventTermCfg, ids: torch.Tensor, step: int) -> bool:
         last = self._last_reset_step[name]
         if cfg.min_step_count_between_reset > 0:
             ids = ids[step - last[ids] >= cfg.min_step_count_between_reset]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
+from mjlab.viewer.backdrop import has_sky, move_sun, paint_sky, prepare_sun
 from mjlab.viewer.camera import nearest_envs, resolve_camera
 from mjlab.viewer.gl_context import open_renderer
 from mjlab.viewer.model_sync import (
@@ -74,6 +75,7 @@ class OffscreenRenderer:
         self._expanded_fields = expanded_fields if expanded_fields is not None else set()
         self._view = resolve_camera(cfg, model, scene.entities)
         self._model = _drawing_model(model, cfg, self._view.fovy)
+        self._has_sky = has_sky(model)
         self._data = mujoco.MjData(self._model)
         self._option = _visibility(cfg)
         self._camera = mujoco.MjvCamera()
@@ -128,6 +130,7 @@ class OffscreenRenderer:
         scene = self.renderer.scene
         env_idx = min(max(self._cfg.env_idx, 0), self._num_envs() - 1)
         self._load(data, env_idx)
+        move_sun(self._model, self._data, self._view.target(self._data.xpos))
         self.renderer.update_scene(
             self._data, camera=self._camera_for(camera), scene_option=self._option
         )
@@ -151,7 +154,10 @@ class OffscreenRenderer:
         Raises:
             RuntimeError: `initialize` has not been called.
         """
-        return self.renderer.render()
+        pixels = self.renderer.render()
+        if not self._has_sky:
+            paint_sky(pixels, self.renderer)
+        return pixels
 
     def close(self) -> None:
         """Close the graphics context; may be called twice, and `initialize` again after it."""
@@ -200,6 +206,7 @@ class OffscreenRenderer:
 def _drawing_model(model: mujoco.MjModel, cfg: ViewerConfig, fovy: float | None) -> mujoco.MjModel:
     private = host_model(model)
     private.stat.extent = max(_MIN_EXTENT, 1.5 * cfg.distance)
+    prepare_sun(private, cfg.distance)
     if fovy is not None:
         private.vis.global_.fovy = fovy
     private.vis.global_.offwidth = max(private.vis.global_.offwidth, cfg.width)

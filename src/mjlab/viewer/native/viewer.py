@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
+from mjlab.viewer.backdrop import move_sun, prepare_sun
 from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction
 from mjlab.viewer.camera import first_moving_body, nearest_envs, resolve_camera
 from mjlab.viewer.errors import RenderingUnavailableError
@@ -71,6 +72,7 @@ class NativeMujocoViewer(BaseViewer):
         self._enable_perturbations = enable_perturbations
         unwrapped = env.unwrapped
         self._model = host_model(unwrapped.sim.mj_model)
+        prepare_sun(self._model, self.cfg.distance)
         # Neighbours are posed in a model of their own, so that the window's is changed only
         # while it is locked.
         self._extra_model = host_model(unwrapped.sim.mj_model)
@@ -217,6 +219,7 @@ class NativeMujocoViewer(BaseViewer):
             sync_model_fields(self._model, sim.model, sim.expanded_fields, self.env_idx)
         copy_state(sim, self.env_idx, self._data)
         mujoco.mj_forward(self._model, self._data)
+        move_sun(self._model, self._data, self._view.target(self._data.xpos))
 
     def _draw_extras(self, scn: mujoco.MjvScene) -> None:
         scn.ngeom = 0

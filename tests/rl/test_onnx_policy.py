@@ -1,0 +1,144 @@
+"""Playing exported policies without an ONNX runtime."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from onnx import TensorProto, helper
+
+from mjlab.rl.onnx_export import export_to_onnx
+from mjlab.rl.onnx_policy import OnnxPolicy, OnnxPolicyError, _alike, load_onnx_policy
+
+ACTIVATIONS = {
+    "elu": torch.nn.ELU(),
+    "relu": torch.nn.ReLU(),
+    "selu": torch.nn.SELU(),
+    "lrelu": torch.nn.LeakyReLU(),
+    "tanh": torch.nn.Tanh(),
+    "sigmoid": torch.nn.Sigmoid(),
+    "softplus": torch.nn.Softplus(),
+    "gelu": torch.nn.GELU(),
+    "swish": torch.nn.SiLU(),
+    "mish": torch.nn.Mish(),
+    "identity": torch.nn.Identity(),
+}
+
+
+class Exported(torch.nn.Module):
+    """What rsl_rl's `as_onnx` gives: a normalizer and a network, for one observation."""
+
+    input_names, output_names = ("obs",), ("actions",)
+
+    def __init__(self, activation: torch.nn.Module):
+        super().__init__()
+        torch.manual_seed(0)
+        self.register_buffer("mean", torch.randn(1, 5))
+        self.register_buffer("std", torch.rand(1, 5) + 0.5)
+        self.net = torch.nn.Sequential(
+            torch.nn.Linear(5, 8), activation, torch.nn.Linear(8, 8), activation,
+            torch.nn.Linear(8, 3),
+        )  # fmt: skip
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        return self.net((obs - self.mean) / (self.std + 0.01))
+
+    def get_dummy_inputs(self) -> tuple[torch.Tensor]:
+        return (torch.zeros(1, 5),)
+
+
+def export(path: Path, activation: str = "elu", **metadata: str) -> Path:
+    export_to_onnx(Exported(ACTIVATIONS[activation]), path)
+    if metadata:
+        model = onnx.load(str(path))
+        helper.set_model_props(model, metadata)
+        onnx.save(model, str(path))
+    return path
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_it_computes_what_onnxruntime_does(tmp_path: Path, activation: str) -> None:
+    path = export(tmp_path / "policy.onnx", activation)
+    policy = OnnxPolicy(path)
+    session = onnxruntime.InferenceSession(str(path))
+    rows = 3.0 * np.random.default_rng(0).standard_normal((6, 5)).astype(np.float32)
+    expected = [session.run(None, {"obs": row[None]})[0][0] for row in rows]
+    # All rows at once, although the file is made for one.
+    np.testing.assert_allclose(policy(torch.from_numpy(rows)), expected, rtol=1e-4, atol=1e-5)
+    assert (policy.num_observations, policy.num_actions) == (5, 3)
+
+
+def test_it_takes_the_group_of_observations_that_it_was_trained_with(tmp_path: Path) -> None:
+    policy = OnnxPolicy(export(tmp_path / "p.onnx", observation_group="walker"))
+    rows = torch.randn(2, 5)
+    groups = {"walker": rows, "critic": torch.zeros(2, 9)}
+    assert torch.equal(policy(groups), policy(rows))
+
+
+def test_what_is_no_policy_is_refused_with_the_reason(tmp_path: Path) -> None:
+    with pytest.raises(OnnxPolicyError, match="There is no policy .*nothing.onnx"):
+        OnnxPolicy(tmp_path / "nothing.onnx")
+    broken = tmp_path / "broken.onnx"
+    broken.write_bytes(export(tmp_path / "p.onnx").read_bytes()[:500])
+    with pytest.raises(OnnxPolicyError, match="not an ONNX file"):
+        OnnxPolicy(broken)
+    (tmp_path / "empty.onnx").touch()
+    with pytest.raises(OnnxPolicyError, match="not an ONNX file"):
+        OnnxPolicy(tmp_path / "empty.onnx")
+
+
+def graph(path: Path, nodes: list, inputs: list[str], outputs: list[str]) -> Path:
+    def values(names: list[str]) -> list:
+        return [helper.make_tensor_value_info(n, TensorProto.FLOAT, [1, 2]) for n in names]
+
+    made = helper.make_graph(nodes, "policy", values(inputs), values(outputs))
+    onnx.save(helper.make_model(made), str(path))
+    return path
+
+
+def test_operators_and_inputs_that_are_not_known_are_named(tmp_path: Path) -> None:
+    lstm = graph(tmp_path / "l.onnx", [helper.make_node("LSTM", ["x"], ["y"])], ["x"], ["y"])
+    with pytest.raises(OnnxPolicyError, match=r"operator LSTM.*Gemm.*Play the checkpoint"):
+        OnnxPolicy(lstm)
+    two = graph(
+        tmp_path / "2.onnx", [helper.make_node("Add", ["x", "h"], ["y"])], ["x", "h"], ["y"]
+    )
+    with pytest.raises(OnnxPolicyError, match=r"inputs \['x', 'h'\]"):
+        OnnxPolicy(two)
+
+
+def test_numbers_of_three_decimals_are_like_the_full_ones_and_other_words_are_not() -> None:
+    assert _alike("0.373,0.249", "0.37275302,0.24850203")
+    assert _alike("0.25", "0.25,0.25,0.25")
+    assert not _alike("0.25,0.5,0.25", "0.25,0.25,0.25")
+    assert not _alike("a,b", "a,c")
+    assert not _alike("a,b", "a")
+
+
+def test_an_environment_with_other_observations_or_actions_is_refused(
+    tmp_path: Path, monkeypatch
+) -> None:
+    path = export(
+        tmp_path / "p.onnx", observation_names="speed,angle", step_dt="0.02", action_scale="0.5"
+    )
+    monkeypatch.setattr(
+        "mjlab.rl.onnx_policy.get_base_metadata",
+        lambda env, run: {
+            "observation_names": ["speed", "height"],
+            "step_dt": 0.02,
+            "action_scale": 0.25,
+        },
+    )
+    env = SimpleNamespace(action_manager=SimpleNamespace(total_action_dim=4))
+    with pytest.raises(OnnxPolicyError) as caught:
+        load_onnx_policy(path, SimpleNamespace(unwrapped=env), "cpu")
+    message = str(caught.value)
+    assert "observation_names: the policy has speed,angle, the environment speed,height" in message
+    assert "action_scale: the policy has 0.5, the environment 0.25" in message
+    assert "actions: the policy has 3, not 4" in message
+    assert "step_dt" not in message

@@ -1,0 +1,98 @@
+"""`demo`, and other exported policies that are played."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+from mjlab.scripts import demo
+
+HEADLESS = ("--viewer", "none", "--num-steps", "3", "--device", "cpu")
+
+
+@pytest.fixture(scope="module")
+def go1_policy(tmp_path_factory) -> Path:
+    """An exported policy of the demo's task that has not learned anything."""
+    from dataclasses import asdict
+
+    from mjlab.scripts.policy import make_env
+    from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
+
+    env = make_env(demo.TASK, load_env_cfg(demo.TASK, play=True), "cpu", 1)
+    cfg = load_rl_cfg(demo.TASK)
+    cfg.actor.hidden_dims = cfg.critic.hidden_dims = (8,)
+    path = tmp_path_factory.mktemp("demo") / "go1.onnx"
+    try:
+        load_runner_cls(demo.TASK)(env, asdict(cfg), None, "cpu").export_policy(str(path))
+    finally:
+        env.close()
+    return path
+
+
+def test_demo_plays_its_policy_without_being_told_anything(run, go1_policy, monkeypatch):
+    monkeypatch.setattr(demo, "POLICY", go1_policy)
+    outcome = run("demo", *HEADLESS)
+    assert outcome.status == 0, outcome.err
+    assert "3 steps in 1 environments" in outcome.out
+
+
+def test_a_policy_that_is_missing_is_said_with_what_to_do(run, monkeypatch, tmp_path):
+    monkeypatch.setattr(demo, "POLICY", tmp_path / "go1.onnx")
+    outcome = run("demo", *HEADLESS)
+    assert outcome.status == 1
+    assert str(tmp_path / "go1.onnx") in outcome.message
+    assert "--checkpoint-file" in outcome.message
+
+
+def test_by_default_one_robot_is_shown_in_the_browser_of_this_machine(monkeypatch):
+    cfg = demo.demo_cfg()
+    assert (cfg.viewer, cfg.num_envs, cfg.device, cfg.host) == ("viser", 1, "cpu", "127.0.0.1")
+    assert cfg.open_browser
+    assert Path(cfg.checkpoint_file) == demo.POLICY
+
+
+def test_help_is_short_and_loads_nothing(run):
+    outcome = run("demo", "--help")
+    assert outcome.status == 0
+    assert "uv run demo" in outcome.out
+
+
+def test_a_bundled_policy_fits_the_task_and_says_how_it_was_made(run):
+    assert (demo.POLICY.parent / "README.md").is_file()
+    if not demo.POLICY.is_file():
+        pytest.skip("the policy is not there yet")
+    assert demo.POLICY.stat().st_size < 2_000_000
+    outcome = run("demo", *HEADLESS)
+    assert outcome.status == 0, outcome.err
+
+
+@pytest.mark.parametrize("script", ["play", "evaluate"])
+def test_exported_policies_are_played_and_evaluated_like_checkpoints(run, trained, script):
+    (policy,) = trained.glob("*.onnx")
+    flags = HEADLESS if script == "play" else ("--num-episodes", "2", "--max-steps", "4")
+    outcome = run(script, "Mjlab-Cartpole-Swingup", "--checkpoint-file", str(policy), *flags)
+    assert outcome.status == 0, outcome.err
+
+
+def test_a_policy_of_another_task_is_refused(run, go1_policy):
+    outcome = run("play", "Mjlab-Cartpole-Swingup", "--checkpoint-file", str(go1_policy), *HEADLESS)
+    assert outcome.status == 1
+    assert "trained for another environment" in outcome.message
+    assert "base_lin_vel" in outcome.message
+
+
+@pytest.mark.parametrize(
+    ("platform", "display", "opened"),
+    [("linux", None, False), ("linux", ":1", True), ("darwin", None, True)],
+)
+def test_a_browser_is_opened_only_where_there_is_a_display(monkeypatch, platform, display, opened):
+    play_run = importlib.import_module("mjlab.scripts.play_run")
+    monkeypatch.setattr(play_run.sys, "platform", platform)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    if display is None:
+        monkeypatch.delenv("DISPLAY", raising=False)
+    else:
+        monkeypatch.setenv("DISPLAY", display)
+    assert play_run._can_open_browser() is opened

@@ -1,0 +1,128 @@
+"""Sliders that command the robot in view."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from mjlab.tasks.velocity.mdp import UniformVelocityCommandCfg
+from mjlab.tasks.velocity.mdp.velocity_joystick import VelocityJoystick
+
+RANGES = UniformVelocityCommandCfg.Ranges((-1.5, 2.0), (-1.0, 1.0), (0.0, 0.0))
+
+
+class Widget:
+    """A slider, check box or button of a page."""
+
+    def __init__(self, value=None, low=None, high=None):
+        self.value, self.min, self.max = value, low, high
+        self.callbacks = []
+
+    def on_update(self, callback):
+        self.callbacks.append(callback)
+        return callback
+
+    on_click = on_update
+
+    def set_by_person(self, value=None) -> None:
+        """Do what a person in a browser does."""
+        self.value = value
+        for callback in self.callbacks:
+            callback(SimpleNamespace(client=object(), target=self))
+
+
+class Page:
+    """A page that keeps its widgets by label."""
+
+    def __init__(self):
+        self.gui = self
+        self.widgets = {}
+
+    def add_folder(self, name):
+        self.widgets[name] = None
+        return self
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def add_checkbox(self, label, value, hint=""):
+        return self._add(label, Widget(value))
+
+    def add_slider(self, label, low, high, step, value):
+        assert low <= value <= high
+        return self._add(label, Widget(value, low, high))
+
+    def add_button(self, label):
+        return self._add(label, Widget())
+
+    def _add(self, label, widget):
+        self.widgets[label] = widget
+        return widget
+
+
+@pytest.fixture
+def page() -> Page:
+    return Page()
+
+
+def make(page: Page, env_idx: int = 1) -> tuple[VelocityJoystick, list[int]]:
+    changes: list[int] = []
+    joystick = VelocityJoystick("twist", page, RANGES, lambda: env_idx, lambda: changes.append(1))
+    return joystick, changes
+
+
+def test_it_commands_the_environment_in_view_and_no_other_once_it_is_enabled(page):
+    joystick, _ = make(page)
+    command = torch.full((3, 3), 0.25)
+    joystick.write_to(command)
+    assert (command == 0.25).all()
+    page.widgets["Enable"].set_by_person(True)
+    page.widgets["lin_vel_x"].set_by_person(1.5)
+    page.widgets["ang_vel_z"].set_by_person(-0.05)
+    joystick.write_to(command)
+    assert command.tolist()[1] == pytest.approx([1.5, 0.0, -0.05])
+    assert (command[[0, 2]] == 0.25).all()
+
+
+def test_moving_a_slider_takes_the_helm(page):
+    joystick, changes = make(page, env_idx=0)
+    page.widgets["lin_vel_x"].set_by_person(0.5)
+    assert page.widgets["Enable"].value
+    command = torch.zeros(1, 3)
+    joystick.write_to(command)
+    assert command[0, 0] == 0.5
+    assert changes
+
+
+def test_zero_stops_the_robot(page):
+    joystick, _ = make(page, env_idx=0)
+    for name, value in (("lin_vel_x", 0.5), ("lin_vel_y", 0.5), ("ang_vel_z", 0.05)):
+        page.widgets[name].set_by_person(value)
+    page.widgets["Zero"].set_by_person()
+    command = torch.ones(1, 3)
+    joystick.write_to(command)
+    assert command.tolist() == [[0.0, 0.0, 0.0]]
+
+
+def test_sliders_reach_the_ends_of_the_range_and_as_far_as_max_says(page):
+    make(page)
+    forward = page.widgets["lin_vel_x"]
+    assert (forward.min, forward.max) == (-2.0, 2.0)
+    # An empty range still gives a slider that can be moved.
+    assert page.widgets["ang_vel_z"].max > 0.0
+    forward.set_by_person(1.75)
+    page.widgets["Max lin_vel_x"].set_by_person(1.0)
+    assert (forward.min, forward.max, forward.value) == (-1.0, 1.0, 1.0)
+
+
+def test_a_view_of_no_environment_commands_none(page):
+    joystick, _ = make(page, env_idx=7)
+    page.widgets["Enable"].set_by_person(True)
+    command = torch.ones(2, 3)
+    joystick.write_to(command)
+    assert (command == 1.0).all()
