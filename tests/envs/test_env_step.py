@@ -159,6 +159,34 @@ def test_a_metric_that_looks_between_substeps_changes_nothing_else(make):
     assert len(set(seen)) == len(seen), "every call has to see another substep"
 
 
+def test_targets_that_are_the_same_in_all_substeps_are_written_once(make, monkeypatch):
+    per_substep = {"m": MetricsTermCfg(func=lambda env: env.sim.data.qvel[:, 0], per_substep=True)}
+    env = make(lambda cfg: cfg.metrics.update(per_substep))
+    calls = []
+    for owner, name in ((env.action_manager, "apply_action"), (env.scene, "write_data_to_sim")):
+        original = getattr(owner, name)
+        monkeypatch.setattr(
+            owner, name, lambda *args, f=original, n=name: (calls.append(n), f(*args))[1]
+        )
+    run(env, 1)
+    assert calls == ["apply_action", "write_data_to_sim"]
+    # An actuator or an action that changes between substeps is asked before each of them.
+    env._acts_between_substeps = True
+    calls.clear()
+    run(env, 1)
+    assert calls == ["apply_action", "write_data_to_sim"] * env.cfg.decimation
+
+
+def delay_the_actuator(cfg: ManagerBasedRlEnvCfg) -> None:
+    robot = next(iter(cfg.scene.entities.values()))
+    for actuator in robot.articulation.actuators:
+        actuator.delay_max_lag = 2
+
+
+def test_an_actuator_with_a_delay_acts_in_every_substep(make):
+    assert make(delay_the_actuator)._acts_between_substeps
+
+
 # Episodes.
 
 

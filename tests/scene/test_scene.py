@@ -14,7 +14,11 @@ from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
 from mjlab.scene import Scene, SceneCfg
 from mjlab.sensor import BuiltinSensorCfg, ObjRef, Sensor, SensorCfg
 from mjlab.sim import Simulation, SimulationCfg
-from mjlab.terrains import TerrainEntityCfg
+from mjlab.terrains import (
+    HfWaveTerrainCfg,
+    TerrainEntityCfg,
+    TerrainGeneratorCfg,
+)
 
 InitialState = EntityCfg.InitialStateCfg
 
@@ -351,3 +355,24 @@ def test_a_written_scene_compiles_to_the_same_model(kit, tmp_path):
     with pytest.warns(DeprecationWarning, match="Scene.write"):
         scene.to_zip(tmp_path / "old.zip")
     assert (tmp_path / "old.zip").is_file()
+
+
+def test_a_scene_on_height_fields_can_be_written_once_it_is_compiled(tmp_path):
+    # The colors of a height field are a texture made from pixels, which XML cannot hold.
+    generator = TerrainGeneratorCfg(
+        seed=1,
+        size=(4.0, 4.0),
+        num_rows=2,
+        num_cols=2,
+        sub_terrains={"waves": HfWaveTerrainCfg(amplitude_range=(0.1, 0.2))},
+    )
+    scene = build(terrain=TerrainEntityCfg(terrain_type="generator", terrain_generator=generator))
+    model = scene.compile()
+    scene.write(tmp_path / "out")
+    scene.terrain.write_xml(tmp_path / "terrain.xml")
+    for path in (tmp_path / "out" / "scene.xml", tmp_path / "terrain.xml"):
+        again = mujoco.MjModel.from_xml_path(str(path))
+        assert again.nhfield == model.nhfield == 4
+        np.testing.assert_array_equal(again.geom_type, model.geom_type)
+        np.testing.assert_allclose(again.geom_pos, model.geom_pos, atol=1e-5)
+        np.testing.assert_allclose(again.hfield_data, model.hfield_data, atol=1e-5)

@@ -11,6 +11,7 @@ from mjlab.entity import EntityCfg
 from mjlab.scene import Scene, SceneCfg
 from mjlab.sensor import BuiltinSensor, BuiltinSensorCfg, ObjRef
 from mjlab.sim import Simulation, SimulationCfg
+from mjlab.terrains import TerrainEntityCfg
 
 XML = """
 <mujoco><worldbody><body name="base"><freejoint/><geom name="g" size=".1" pos=".1 0 0"/>
@@ -22,9 +23,9 @@ XML = """
 """
 
 
-def scene_with(*sensors, num_envs=2) -> tuple[Simulation, Scene]:
-    robot = EntityCfg(spec_fn=lambda: mujoco.MjSpec.from_string(XML))
-    scene = Scene(SceneCfg(num_envs=num_envs, entities={"r": robot}, sensors=sensors), "cpu")
+def scene_with(*sensors, num_envs=2, **fields) -> tuple[Simulation, Scene]:
+    fields.setdefault("entities", {"r": EntityCfg(spec_fn=lambda: mujoco.MjSpec.from_string(XML))})
+    scene = Scene(SceneCfg(num_envs=num_envs, sensors=sensors, **fields), "cpu")
     sim = Simulation(num_envs, SimulationCfg(), spec=scene.spec, device="cpu")
     scene.initialize(sim.mj_model, sim.model, sim.data)
     return sim, scene
@@ -133,6 +134,31 @@ def test_names_with_and_without_an_entity():
     _, scene = scene_with(own, world)
     assert list(scene.sensors) == ["r/gyro", "gyro"]
     assert torch.equal(scene["r/gyro"].data, scene["gyro"].data)
+
+
+def test_elements_of_the_terrain_are_found_though_it_has_no_prefix():
+    ground = ObjRef("geom", "terrain", entity="terrain")
+    above = BuiltinSensorCfg(name="above", sensor_type="framepos", obj=ref("body"), ref=ground)
+    below = BuiltinSensorCfg(name="below", sensor_type="framepos", obj=ground, ref=ref("body"))
+    sim, scene = scene_with(above, below, terrain=TerrainEntityCfg())
+    sim.data.qpos[:, 2] = 3.0
+    sim.forward()
+    assert scene["r/above"].data[0, 2] == -scene["terrain/below"].data[0, 2] == 3.0
+    wrong = BuiltinSensorCfg(
+        name="x", sensor_type="framepos", obj=ObjRef("xbody", "base", entity="terrain")
+    )
+    with pytest.raises(ValueError, match=r"entity 'terrain' .* \['world', 'terrain'\]"):
+        scene_with(wrong, terrain=TerrainEntityCfg())
+
+
+def test_an_entity_called_terrain_has_its_prefix_where_there_is_no_terrain():
+    rocks = EntityCfg(spec_fn=lambda: mujoco.MjSpec.from_string(XML))
+    cfg = BuiltinSensorCfg(
+        name="where", sensor_type="framepos", obj=ObjRef("site", "imu", entity="terrain")
+    )
+    sim, _ = scene_with(cfg, entities={"terrain": rocks})
+    sensor = sim.mj_model.sensor("terrain/where")
+    assert sensor.objid[0] == sim.mj_model.site("terrain/imu").id
 
 
 def test_unknown_elements_and_entities_list_the_candidates():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import math
 import typing
 from dataclasses import dataclass
@@ -308,6 +310,44 @@ def test_data_is_zero_before_the_first_sense_and_then_that_of_the_last_one():
 
 def test_a_ray_sensor_does_not_split_the_physics_step():
     assert not scene_with(scan())[1].needs_substep
+
+
+class Counting(RayCastSensor):
+    """Does something after every substep."""
+
+    def update(self, dt: float) -> None:
+        self.updates = getattr(self, "updates", 0) + 1
+
+
+def test_a_subclass_that_overrides_update_is_updated_at_every_substep():
+    assert Counting(scan()).needs_substep
+
+
+def test_what_was_measured_is_computed_once_until_rays_are_cast_again():
+    sim, scene = scene_with(scan(), TerrainHeightSensorCfg(name="height", frame=BASE))
+    sense(sim)
+    for name in ("scan", "height"):
+        before = scene[name].data
+        scene.update(0.01)
+        scene.reset()
+        assert scene[name].data is before
+        sense(sim)
+        assert scene[name].data is not before
+
+
+def test_orientations_are_those_of_the_time_of_sensing_whenever_they_are_read():
+    sim, scene = scene_with(scan())
+    tilted = quat_from_euler_xyz(*(torch.tensor([a]) for a in (0.3, -0.2, 0.1)))
+    sim.data.qpos[:, 3:7] = tilted
+    sense(sim)
+    data = scene["scan"].data
+    sim.data.qpos[:, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    sense(sim)
+    torch.testing.assert_close(data.quat_w, tilted)
+    torch.testing.assert_close(data.frame_quat_w[:, 0], tilted)
+    assert [f.name for f in dataclasses.fields(copy.deepcopy(data))][-1] == "frame_quat_w"
+    with pytest.raises(AttributeError, match="no attribute 'quat'"):
+        _ = data.quat
 
 
 def test_sensors_that_see_the_same_groups_are_cast_together(monkeypatch):

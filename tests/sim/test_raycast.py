@@ -207,12 +207,16 @@ def terrain_model(turned: bool, moving: bool, hills: bool, meshes: bool = False)
 
 
 def mj_ray(model, data, origin, direction, groups, exclude) -> tuple[float, np.ndarray]:
+    return mj_ray_hit(model, data, origin, direction, groups, exclude)[:2]
+
+
+def mj_ray_hit(model, data, origin, direction, groups, exclude=-1) -> tuple[float, np.ndarray, int]:
     normal, geom = np.zeros(3), np.array([-1], dtype=np.int32)
     mask = None if groups is None else np.isin(np.arange(6), groups).astype(np.uint8)
     distance = mujoco.mj_ray(
         model, data, origin.astype(float), direction.astype(float), mask, 1, exclude, geom, normal
     )
-    return distance, normal
+    return distance, normal, int(geom[0])
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -312,6 +316,75 @@ def test_what_is_near_is_met_as_everything_is_to_the_bit():
     assert {mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_") for kind in met} >= kinds
     for a, b in zip(everything, near, strict=True):
         assert torch.equal(a, b)
+
+
+PLANES = """
+<mujoco><worldbody>
+  <geom name="ground" type="plane" size="0 0 1" pos="0 0 -.3"/>
+  <geom name="table" type="plane" size="1.5 0 .1" pos=".2 .1 .4" euler="10 -20 30"/>
+  <geom name="shelf" type="plane" size=".5 .8 .1" pos="0 0 1.1"/>
+  <geom name="lamp" type="sphere" size=".5" pos="0 0 1.5" group="1"/>
+  <body name="ball" pos="0 0 3"><freejoint/><geom size=".1" group="3"/></body>
+  <body name="lift" mocap="true"><geom type="plane" size="1 1 .1" group="2"/></body>
+</worldbody></mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def planes():
+    model = mujoco.MjModel.from_xml_string(PLANES)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return Simulation(2, SimulationCfg(engine="native"), model=model, device="cpu"), data
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**31), slant=st.sampled_from([0.0, 0.5, 3.0]))
+def test_rays_against_nothing_but_planes_are_those_of_mj_ray(planes, seed, slant):
+    sim, data = planes
+    generator = torch.Generator().manual_seed(seed)
+    origins = 4.0 * torch.rand(2, 12, 3, generator=generator) - 2.0
+    directions = slant * torch.randn(2, 12, 3, generator=generator)
+    directions[..., 2] -= 1.0
+    directions /= directions.norm(dim=-1, keepdim=True)
+    origins[1, 0, 0] = torch.nan
+    distances, normals, geoms = sim.raycast(origins, directions, (0,))
+    # A ray of an environment that has diverged meets nothing.
+    assert distances[1, 0] == -1
+    assert geoms[1, 0] == -1
+    for env, r in origins.isfinite().all(dim=-1).nonzero().tolist():
+        distance, normal, geom = mj_ray_hit(
+            sim.mj_model, data, origins[env, r].numpy(), directions[env, r].numpy(), (0,)
+        )
+        assert distances[env, r].item() == pytest.approx(distance, rel=1e-6, abs=1e-6)
+        np.testing.assert_allclose(normals[env, r], normal, atol=1e-7)
+        assert geoms[env, r] == geom
+
+
+@pytest.mark.parametrize(
+    ("groups", "excluded", "is_alone"),
+    [((0,), -1, True), ((0,), 1, True), ((0,), 0, False), ((0, 1), -1, False), ((2,), -1, False)],
+)
+def test_only_rays_that_meet_fixed_planes_alone_are_computed_without_a_query(
+    planes, groups, excluded, is_alone
+):
+    sim, _ = planes
+    origins, directions = rays(((0.0, 0.0, 2.5), DOWN))
+    for _ in range(2):
+        sim.raycast(origins, directions, groups, torch.tensor([excluded], dtype=torch.int32))
+    plan = list(sim._engine._rays._plans.values())[-1]
+    assert (plan.planes is not None) == is_alone
+
+
+def test_planes_that_a_randomization_has_moved_are_met_where_they_are():
+    model = mujoco.MjModel.from_xml_string(PLANES)
+    sim = Simulation(2, SimulationCfg(engine="native"), model=model, device="cpu")
+    origins, directions = rays(((0.0, 0.0, 2.0), DOWN))
+    sim.raycast(origins, directions, (0,))
+    sim.expand_model_fields(("geom_pos",))
+    sim.model.geom_pos[1, model.geom("shelf").id, 2] = 1.6
+    distances = sim.raycast(origins, directions, (0,))[0]
+    assert distances.flatten().tolist() == pytest.approx([0.9, 0.4])
 
 
 def test_geoms_that_a_randomization_has_moved_are_met_where_they_are():

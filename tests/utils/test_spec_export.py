@@ -93,6 +93,14 @@ def test_a_missing_file_is_named_and_nothing_is_written(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_spec_that_is_part_of_another_is_refused(tmp_path):
+    part, whole = mujoco.MjSpec(), mujoco.MjSpec()
+    whole.attach(part, prefix="", frame=whole.worldbody.add_frame())
+    with pytest.raises(ValueError, match="attached to another one"):
+        export_spec(part, tmp_path / "out")
+    export_spec(whole, tmp_path / "out")
+
+
 def test_paths_become_absolute_where_there_is_a_file(tmp_path):
     path = _robot_file(tmp_path, "one", "meshes", "part.obj", 1.0)
     spec = mujoco.MjSpec.from_file(str(path))

@@ -31,6 +31,18 @@ def test_a_pattern_that_matches_nothing_is_reported(caplog, match):
     assert "hip_a" in caplog.text
 
 
+@pytest.mark.parametrize("match", [resolve_expr, filter_exp])
+def test_of_many_names_the_report_gives_those_that_are_near_and_the_number_of_others(caplog, match):
+    names = (*(f"box_{i}" for i in range(2171)), "pillar")
+    match({"piller": 1}, names)
+    assert caplog.messages == [
+        "Patterns ['piller'] match none of the names ['pillar'] and 2171 others."
+    ]
+    caplog.clear()
+    match({"xyz": 1}, names)
+    assert "['box_0', 'box_1', 'box_2'] and 2169 others." in caplog.text
+
+
 @pytest.mark.parametrize(
     ("patterns", "names"), [({".*": 0.0}, ()), ({"hip_a": 1, "hip.*": 2, ".*": 3}, NAMES)]
 )

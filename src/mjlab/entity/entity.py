@@ -116,6 +116,7 @@ class Entity(NamedElements, EntityCommands):
         """Simulation options that the entity's own XML asks for; the scene decides on them."""
         xml_key = take_keys(spec)
         self._spec = self._placeable(spec)
+        self._spec_to_write = self._spec
         self._free_joint, self._joints = find_joints(self._spec)
         self._data: EntityData | None = None
         self._edit_spec()
@@ -316,13 +317,23 @@ class Entity(NamedElements, EntityCommands):
 
     # Files.
 
+    def keep_spec_to_write(self) -> None:
+        """Keep a copy of the spec for `write_xml` and `to_zip`. A scene calls this.
+
+        MuJoCo cannot write a spec that has been attached to another one.
+        """
+        self._spec_to_write = self._spec.copy()
+
     def write_xml(self, xml_path: Path) -> None:
-        """Write the entity's spec as XML, without textures made from raw pixels."""
-        spec = self._spec.copy()
+        """Write the entity's spec as XML, without textures made from raw pixels.
+
+        Of an entity in a scene this is the spec as it was before the scene took it in.
+        """
+        spec = self._spec_to_write.copy()
         strip_buffer_textures(spec)
         Path(xml_path).write_text(fix_spec_xml(spec.to_xml()))
 
     def to_zip(self, path: Path) -> None:
-        """Write the entity's spec and its assets as MuJoCo's own archive."""
+        """Write the entity's spec and its assets as MuJoCo's own archive, as `write_xml` does."""
         with open(path, "wb") as file:
-            self._spec.to_zip(file)
+            self._spec_to_write.to_zip(file)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 import math
 from typing import TYPE_CHECKING, Any
@@ -112,7 +113,8 @@ class ManagerBasedRlEnv:
         """Torch device of all tensors."""
         return self._device
 
-    @property
+    # Kept, because asking MuJoCo takes longer than many a term, which ask for it in every step.
+    @functools.cached_property
     def physics_dt(self) -> float:
         """Physics time step, in seconds."""
         return float(self.sim.mj_model.opt.timestep)
@@ -186,9 +188,13 @@ class ManagerBasedRlEnv:
             RecorderManager(cfg.recorders, self) if cfg.recorders else NullRecorderManager()
         )
         self._configure_spaces()
+        # What is the same in all substeps of a step is written once.
+        self._acts_between_substeps = self.action_manager.needs_substep or any(
+            entity.needs_substep for entity in self.scene.entities.values()
+        )
         # Without anything that acts between substeps, the engine runs all of them in one go.
         self._steps_as_one = not (
-            self.action_manager.needs_substep
+            self._acts_between_substeps
             or self.scene.needs_substep
             or self.metrics_manager.needs_substep
         )
@@ -319,10 +325,11 @@ class ManagerBasedRlEnv:
             self.sim.step(nstep=substeps)
             self.scene.update(dt=self.step_dt)
             return
-        for _ in range(substeps):
+        for substep in range(substeps):
             self._sim_step_counter += 1
-            self.action_manager.apply_action()
-            self.scene.write_data_to_sim()
+            if substep == 0 or self._acts_between_substeps:
+                self.action_manager.apply_action()
+                self.scene.write_data_to_sim()
             self.sim.step()
             self.scene.update(dt=self.physics_dt)
             self.metrics_manager.compute_substep()

@@ -1,8 +1,8 @@
 """The process behind `train --live`: the page of the policy that another process trains.
 
 It is started by `mjlab.scripts.live`, reads what to show from its standard input, and ends when
-that is closed, however the other process came to its end. It runs at the lowest priority, and
-builds and steps its environment only while a browser is connected.
+that is closed, however the other process came to its end. It builds its environment when the first
+browser connects, and steps it, at the lowest priority, only while one is.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from mjlab.scripts.live import Exchange, LiveJob
 
 _WAITING = 0.25
+_LOWEST_PRIORITY = 19
 
 
 def main() -> None:
     """Show what standard input says. The arguments are the folder of the exchange and the port."""
-    lower_priority()
     # Training decides what Ctrl-C means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     size = int.from_bytes(sys.stdin.buffer.read(8), "little")
@@ -42,12 +42,14 @@ def main() -> None:
 
 
 def lower_priority() -> None:
-    """Take only processor time that nothing else wants, as far as the system can do that."""
+    """Leave the processors to training, as far as the system can do that.
+
+    On Linux the lowest priority is 1.5 % of a processor that others want all of, and what is left
+    of one that they do not. (The idle class would be next to nothing instead: where all
+    processors are busy, the page would stand still.)
+    """
     with contextlib.suppress(OSError, AttributeError):
-        os.nice(19)
-    if hasattr(os, "SCHED_IDLE"):
-        with contextlib.suppress(OSError):
-            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+        os.nice(_LOWEST_PRIORITY)
 
 
 def show(pickled: bytes, exchange: Exchange, port: int) -> None:
@@ -66,6 +68,8 @@ def show(pickled: bytes, exchange: Exchange, port: int) -> None:
         time.sleep(_WAITING)
     exchange.watched.touch()
     viewer = _make_viewer(pickle.loads(pickled), exchange, server)
+    # Not before: at that priority, building would take minutes where all processors are busy.
+    lower_priority()
     note.remove()
     viewer.run(catch_sigint=False)
 

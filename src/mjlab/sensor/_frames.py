@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import torch
 
+from mjlab.sensor._scene_names import find_in_scene
 from mjlab.sensor.builtin_sensor import ObjRef
+from mjlab.utils.string import name_list
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -40,15 +42,16 @@ def check_frames(frames: tuple[ObjRef, ...], entities: dict[str, Entity]) -> Non
 
 def _find(frame: ObjRef, mj_model: mujoco.MjModel) -> int:
     """Return the id of a frame; ValueError with close names if there is none."""
-    index = mujoco.mj_name2id(mj_model, _KINDS[frame.type][2], frame.prefixed_name())
-    if index >= 0:
-        return index
-    accessor = getattr(mj_model, frame.type)
-    names = [accessor(i).name for i in range(getattr(mj_model, f"n{frame.type}"))]
-    prefix = f"{frame.entity}/" if frame.entity else ""
-    own = [name.removeprefix(prefix) for name in names if name and name.startswith(prefix)]
-    close = difflib.get_close_matches(frame.name, own, n=3)
-    hint = f"Close names: {', '.join(close)}." if close else f"It has: {own}."
+    kind = _KINDS[frame.type][2]
+    names = [
+        mujoco.mj_id2name(mj_model, kind, i) or ""
+        for i in range(getattr(mj_model, f"n{frame.type}"))
+    ]
+    full_name, offered = find_in_scene(frame, names)
+    if full_name is not None:
+        return names.index(full_name)
+    close = difflib.get_close_matches(frame.name, offered, n=3)
+    hint = f"Close names: {', '.join(close)}." if close else f"It has: {name_list(offered, [])}."
     owner = f"Entity {frame.entity!r}" if frame.entity else "The scene"
     raise ValueError(f"{owner} has no {frame.type} {frame.name!r}. {hint}")
 

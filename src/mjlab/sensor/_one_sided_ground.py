@@ -57,9 +57,9 @@ class OneSidedGround:
         start[is_field] = m.hfield_adr[fields[is_field]]
         self._shape = torch.from_numpy(shape).to(device)
         self._start = torch.from_numpy(start).to(device)
-        # Planes read elevations too, which then count for nothing.
-        heights = m.hfield_data if is_field.any() else np.zeros(4)
-        self._heights = _tensor(heights, device)
+        # Planes among height fields read elevations too, which then count for nothing.
+        self._has_fields = bool(is_field.any())
+        self._heights = _tensor(m.hfield_data, device)
 
     def __len__(self) -> int:
         return len(self._geoms)
@@ -95,6 +95,8 @@ class OneSidedGround:
 
         A height field is made of triangles: each cell is cut from its first to its last corner.
         """
+        if not self._has_fields:
+            return torch.zeros_like(local[..., 2])
         cells = self._shape[geoms].flip(-1) - 1
         scaled = (local[..., :2] / self._extent[geoms] + 1.0) * 0.5 * cells
         # Positions beyond the edge count for nothing, but have to read something.

@@ -11,6 +11,7 @@ RayAlignment = Literal["base", "yaw", "world"]
 
 # Below this horizontal length of the frame's x axis, its y axis says where the frame points.
 _STEEP = 0.1
+_TINY = 1e-12
 
 
 def heading(mat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -20,12 +21,13 @@ def heading(mat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     nearly vertical (projection shorter than 0.1), it is the projection (a, b) of the y axis turned
     back by a quarter: (b, -a).
     """
-    x, y = mat[..., :2, 0], mat[..., :2, 1]
-    length = x.norm(dim=-1)
-    turned = torch.stack((y[..., 1], -y[..., 0]), dim=-1)
-    axis = torch.where((length < _STEEP)[..., None], turned, x)
-    cosine, sine = torch.nn.functional.normalize(axis, dim=-1).unbind(-1)
-    return cosine, sine
+    # By components: an operation over a last dimension of two takes a CPU ten times as long.
+    x, y = mat[..., 0, 0], mat[..., 1, 0]
+    is_steep = x * x + y * y < _STEEP**2
+    x = torch.where(is_steep, mat[..., 1, 1], x)
+    y = torch.where(is_steep, -mat[..., 0, 1], y)
+    length = (x * x + y * y).sqrt_().clamp_(min=_TINY)
+    return x / length, y / length
 
 
 def is_constant(vectors: torch.Tensor, alignment: RayAlignment) -> bool:
@@ -55,17 +57,19 @@ def rotate_into(
         start: (N, F, 3) world positions; None for none.
     """
     x, y, z = vectors.unbind(-1)
+    if alignment == "yaw":
+        cosine, sine = (part[..., None] for part in heading(mat))
+        turn = (cosine, -sine), (sine, cosine)
+    else:
+        turn = ()
     for axis, column in enumerate(out.unbind(-1)):
-        # Written as a sum from the smallest part, the start, to the vectors.
-        origin = 0.0 if start is None else start[..., axis, None]
         if alignment == "base":
-            rows = mat[..., axis, :, None].unbind(-2)
-            column.copy_(origin + rows[0] * x)
-            column.addcmul_(rows[1], y).addcmul_(rows[2], z)
+            first, second, third = mat[..., axis, :, None].unbind(-2)
+            part = (first * x).addcmul_(second, y).addcmul_(third, z)
         elif alignment == "world" or axis == 2:
-            column.copy_(origin + vectors[:, axis])
+            part = vectors[:, axis].expand_as(column)
         else:
-            cosine, sine = (part[..., None] for part in heading(mat))
-            first, second = (cosine, -sine) if axis == 0 else (sine, cosine)
-            column.copy_(origin + first * x)
-            column.addcmul_(second, y)
+            first, second = turn[axis]
+            part = (first * x).addcmul_(second, y)
+        # The start comes last: far from the origin, sums with it are rounded most.
+        torch.add(part, 0.0 if start is None else start[..., axis, None], out=column)

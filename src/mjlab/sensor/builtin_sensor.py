@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import mujoco
 import torch
 
+from mjlab.sensor._scene_names import find_in_scene
 from mjlab.sensor.sensor import Sensor, SensorCfg
+from mjlab.utils.string import name_list
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -55,10 +57,11 @@ class ObjRef:
     name: str
     """Name, without the prefix of its entity."""
     entity: str | None = None
-    """The entity that the element belongs to; None for elements of the scene itself."""
+    """The entity that the element belongs to, `terrain` included; None takes `name` as it is in the
+    scene."""
 
     def prefixed_name(self) -> str:
-        """Return the element's name in the scene."""
+        """Return the element's name in the scene, except that a terrain has no prefix there."""
         return f"{self.entity}/{self.name}" if self.entity else self.name
 
 
@@ -162,11 +165,11 @@ class BuiltinSensor(Sensor[torch.Tensor]):
             name=name, type=getattr(mujoco.mjtSensor, f"mjSENS_{kind.upper()}")
         )
         if cfg.obj is not None:
-            _check_exists(name, cfg.obj, scene_spec, entities)
-            sensor.objtype, sensor.objname = _object_type(cfg.obj), cfg.obj.prefixed_name()
+            sensor.objname = _full_name(name, cfg.obj, scene_spec, entities)
+            sensor.objtype = _object_type(cfg.obj)
         if cfg.ref is not None:
-            _check_exists(name, cfg.ref, scene_spec, entities)
-            sensor.reftype, sensor.refname = _object_type(cfg.ref), cfg.ref.prefixed_name()
+            sensor.refname = _full_name(name, cfg.ref, scene_spec, entities)
+            sensor.reftype = _object_type(cfg.ref)
         if cfg.sensor_type == "rangefinder":
             # Of what a rangefinder can report, the distance alone.
             sensor.intprm[0] = 1 << int(mujoco.mjtRayDataField.mjRAYDATA_DIST)
@@ -191,21 +194,19 @@ def _object_type(obj: ObjRef) -> mujoco.mjtObj:
     return getattr(mujoco.mjtObj, f"mjOBJ_{obj.type.upper()}")
 
 
-def _check_exists(
-    sensor: str, obj: ObjRef, spec: mujoco.MjSpec, entities: dict[str, Entity]
-) -> None:
+def _full_name(sensor: str, obj: ObjRef, spec: mujoco.MjSpec, entities: dict[str, Entity]) -> str:
+    """Return the name in the scene of what `obj` refers to; ValueError if there is no such thing."""
     if obj.entity and obj.entity not in entities:
         raise ValueError(
             f"Sensor {sensor!r} refers to the entity {obj.entity!r}. The scene has: "
             f"{sorted(entities)}."
         )
     kind = "bodies" if obj.type in ("body", "xbody") else f"{obj.type}s"
-    names = [element.name for element in getattr(spec, kind)]
-    if obj.prefixed_name() not in names:
-        prefix = f"{obj.entity}/" if obj.entity else ""
-        candidates = [n.removeprefix(prefix) for n in names if n and n.startswith(prefix)]
+    full_name, offered = find_in_scene(obj, [element.name for element in getattr(spec, kind)])
+    if full_name is None:
         raise ValueError(
             f"Sensor {sensor!r} refers to the {obj.type} {obj.name!r}, which "
             f"{f'entity {obj.entity!r}' if obj.entity else 'the scene'} does not have. It has: "
-            f"{candidates}."
+            f"{name_list(offered, near=[obj.name])}."
         )
+    return full_name

@@ -12,6 +12,7 @@ import torch
 
 from mjlab.sensor._frames import Frames, check_frames
 from mjlab.sensor._ray_alignment import RayAlignment, is_constant, rotate_into
+from mjlab.sensor._ray_data import RayCastData
 from mjlab.sensor._ray_debug import VizCfg, draw_rays
 from mjlab.sensor._ray_patterns import (
     GridPatternCfg,
@@ -21,7 +22,6 @@ from mjlab.sensor._ray_patterns import (
 )
 from mjlab.sensor.builtin_sensor import ObjRef
 from mjlab.sensor.sensor import Sensor, SensorCfg
-from mjlab.utils.lab_api.math import quat_from_matrix
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -68,26 +68,6 @@ class RayCastSensorCfg(SensorCfg):
     def build(self) -> RayCastSensor:
         """Build the sensor."""
         return RayCastSensor(self)
-
-
-@dataclass
-class RayCastData:
-    """What a ray sensor with F frames of n rays has measured; ray `f n + r` is ray r of frame f."""
-
-    distances: torch.Tensor
-    """(N, F n) metres; -1 for a miss."""
-    normals_w: torch.Tensor
-    """(N, F n, 3) unit surface normals in the world frame; 0 for a miss."""
-    hit_pos_w: torch.Tensor
-    """(N, F n, 3) world positions of what is hit; for a miss, where the ray starts."""
-    pos_w: torch.Tensor
-    """(N, 3) world position of the first frame."""
-    quat_w: torch.Tensor
-    """(N, 4) orientation of the first frame, not aligned."""
-    frame_pos_w: torch.Tensor
-    """(N, F, 3) world positions of the frames."""
-    frame_quat_w: torch.Tensor
-    """(N, F, 4) orientations of the frames, not aligned."""
 
 
 class RayCastSensor(Sensor[RayCastData]):
@@ -223,6 +203,17 @@ class RayCastSensor(Sensor[RayCastData]):
 
     # Sensing.
 
+    def update(self, dt: float) -> None:
+        """Do nothing: what was measured stays until rays are cast again."""
+
+    def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
+        """Do nothing, likewise."""
+
+    @property
+    def needs_substep(self) -> bool:
+        """Whether a subclass does something in `update` after all."""
+        return type(self).update is not RayCastSensor.update
+
     def prepare_rays(self) -> None:
         """Compute the rays in the world frame from the current poses of the frames."""
         alignment = self.cfg.ray_alignment
@@ -254,20 +245,17 @@ class RayCastSensor(Sensor[RayCastData]):
         self.invalidate_cache()
 
     def _compute_data(self) -> RayCastData:
-        return RayCastData(**self._measured())
+        return RayCastData.with_frames(self._frame_mat.clone(), **self._measured())
 
     def _measured(self) -> dict[str, torch.Tensor]:
-        """Return the fields of the data."""
+        """Return the fields of the data, but for the orientations of the frames."""
         reach = self._distances.clamp(min=0.0).unsqueeze(-1)
-        frame_quat = quat_from_matrix(self._frame_mat)
         return {
             "distances": self._distances,
             "normals_w": self._normals,
             "hit_pos_w": torch.addcmul(self._origins, self._directions, reach),
             "pos_w": self._frame_pos[:, 0],
-            "quat_w": frame_quat[:, 0],
             "frame_pos_w": self._frame_pos,
-            "frame_quat_w": frame_quat,
         }
 
     # Looking at it.

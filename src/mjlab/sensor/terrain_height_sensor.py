@@ -73,11 +73,13 @@ class TerrainHeightSensor(RayCastSensor):
         measured = self._measured()
         heights = self._heights_of_rays(measured)
         rays = heights.unflatten(1, (self.num_frames, self.num_rays_per_frame))
-        return TerrainHeightData(**measured, heights=_reduce(rays, self.cfg.reduction))
+        reduced = _reduce(rays, self.cfg.reduction)
+        return TerrainHeightData.with_frames(self._frame_mat.clone(), **measured, heights=reduced)
 
     def _heights_of_rays(self, measured: dict[str, torch.Tensor]) -> torch.Tensor:
-        frame_z = self._frame_pos[..., 2].repeat_interleave(self.num_rays_per_frame, dim=1)
-        heights = frame_z - measured["hit_pos_w"][..., 2]
+        of_frame = self.num_frames, self.num_rays_per_frame
+        hit_z = measured["hit_pos_w"][..., 2].unflatten(1, of_frame)
+        heights = (self._frame_pos[..., 2:] - hit_z).flatten(1)
         heights = torch.where(self._normals[..., 2] < 0.0, 0.0, heights)
         missed = self._distances < 0.0
         heights = torch.where(missed, self.cfg.max_distance, heights)

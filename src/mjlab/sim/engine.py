@@ -40,8 +40,8 @@ class Capabilities:
     """One line for people: the library, its version, the device, the number of threads."""
     num_threads: int | None = None
     """Physics threads, or None where the engine has no such notion."""
-    raycast: bool = True
-    """Whether `Engine.raycast` works."""
+    raycast_problem: str | None = None
+    """Why `Engine.raycast` does not work with this model, and what to do; None if it works."""
     render: bool = False
     """Whether `Engine.render` works."""
 

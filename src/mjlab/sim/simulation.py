@@ -12,7 +12,12 @@ import numpy as np
 import torch
 
 from mjlab.sim.config import SimulationCfg
-from mjlab.sim.engine import Capabilities, create_engine, resolve_engine_name
+from mjlab.sim.engine import (
+    Capabilities,
+    EngineUnavailableError,
+    create_engine,
+    resolve_engine_name,
+)
 from mjlab.sim.fields import FieldView, SharedField
 from mjlab.utils.nan_guard import NanGuard
 
@@ -254,7 +259,14 @@ class Simulation:
             self._sensor_context.sense(self.raycast)
 
     def set_sensor_context(self, ctx: Any) -> None:
-        """Set the object whose `sense(raycast)` evaluates camera and ray sensors."""
+        """Set the object whose `sense(raycast)` evaluates camera and ray sensors.
+
+        Raises:
+            EngineUnavailableError: it has ray sensors, and the engine casts no rays in this model.
+        """
+        problem = self.capabilities.raycast_problem
+        if ctx.has_raycasts and problem is not None:
+            raise EngineUnavailableError(problem)
         self._sensor_context = ctx
 
     def create_graph(self) -> None:

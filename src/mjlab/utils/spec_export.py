@@ -22,8 +22,14 @@ def export_spec(spec: mujoco.MjSpec, output_dir: Path, *, zip: bool = False) -> 
     Textures made from raw pixels are left out, with the materials that use them, because XML
     cannot hold them. With `zip` the result is the archive `<output_dir>.zip` instead of a folder.
 
-    Raises `ValueError` if a file cannot be found.
+    Raises `ValueError` if a file cannot be found, or if the spec has been attached to another one.
     """
+    if spec.parent is not None:
+        # MuJoCo would end the process.
+        raise ValueError(
+            f"The spec {spec.modelname!r} has been attached to another one, and MuJoCo cannot "
+            "write it any more. Write the whole (`spec.parent`), or a copy made before attaching."
+        )
     output_dir = Path(output_dir)
     if not zip:
         _write_folder(spec, output_dir)

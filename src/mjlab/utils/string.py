@@ -6,12 +6,17 @@ are strict instead: see `mjlab.utils.lab_api.string.resolve_matching_names`.
 
 from __future__ import annotations
 
+import difflib
 import logging
 import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 logger = logging.getLogger(__name__)
+
+# So many names are listed in full; of more, so many for each name that was looked for.
+_FEW = 12
+_SHOWN = 3
 
 
 def resolve_expr(
@@ -70,6 +75,19 @@ def qualified_name(value: Any) -> str:
     return f"{module}:{named.__qualname__}"
 
 
+def name_list(names: Sequence[str], near: Iterable[str]) -> str:
+    """Return `names` for a message: all if they are few, else those near any of `near`.
+
+    "['a', 'b']", or "['leg_1', 'leg_2'] and 198 others". Where nothing is near, the first names are
+    given.
+    """
+    if len(names) <= _FEW:
+        return str(list(names))
+    close = [name for one in near for name in difflib.get_close_matches(one, names, n=_SHOWN)]
+    shown = list(dict.fromkeys(close))[:_FEW] or list(names[:_SHOWN])
+    return f"{shown} and {len(names) - len(shown)} others"
+
+
 def _report_unmatched(patterns: Iterable[re.Pattern[str]], names: Sequence[str]) -> None:
     # Nothing can match where there are no names: the default pattern ".*" of an entity without
     # joints is no mistake.
@@ -77,4 +95,6 @@ def _report_unmatched(patterns: Iterable[re.Pattern[str]], names: Sequence[str])
         return
     unmatched = [p.pattern for p in patterns if not any(p.match(name) for name in names)]
     if unmatched:
-        logger.warning("Patterns %s match none of the names %s.", unmatched, list(names))
+        logger.warning(
+            "Patterns %s match none of the names %s.", unmatched, name_list(names, near=unmatched)
+        )

@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 import mujoco
 
 _RGB_ROLE = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
+_STAND_IN = "mjlab_without_texture"
 
 
 def fix_spec_xml(xml: str, meshdir: str | None = None) -> str:
@@ -68,14 +69,33 @@ def strip_buffer_textures(spec: mujoco.MjSpec) -> None:
 
     Removes those textures, the materials whose RGB texture they are, and the references of geoms
     to these materials. Changes `spec`.
+
+    Where MuJoCo will not let go of a reference, those geoms get a material without a texture that
+    looks like none.
     """
     textures = {t.name: t for t in spec.textures if _has_only_pixels(t)}
     materials = {m.name: m for m in spec.materials if m.textures[_RGB_ROLE] in textures}
-    for geom in spec.geoms:
-        if geom.material in materials:
-            geom.material = ""
+    geoms = [geom for geom in spec.geoms if geom.material in materials]
+    for geom in geoms:
+        geom.material = ""
     for element in (*materials.values(), *textures.values()):
         spec.delete(element)
+    if geoms and not _can_be_written(spec):
+        # Once compiled, a geom keeps the id of its material, and no material's name at all does not
+        # reset it, so that the id may now be out of bounds. Another name does.
+        if spec.material(_STAND_IN) is None:
+            spec.add_material(name=_STAND_IN, rgba=(0.5, 0.5, 0.5, 1.0))
+        for geom in geoms:
+            geom.material = _STAND_IN
+
+
+def _can_be_written(spec: mujoco.MjSpec) -> bool:
+    try:
+        spec.to_xml()
+    except ValueError:
+        # What is wrong beyond the materials is told when the spec is written.
+        return False
+    return True
 
 
 def _has_only_pixels(texture: mujoco.MjsTexture) -> bool:

@@ -129,8 +129,8 @@ def height_scan(
     data = sensor.data
     if miss_value is None:
         miss_value = sensor.cfg.max_distance
-    frame_z = data.frame_pos_w[..., 2].repeat_interleave(sensor.num_rays_per_frame, dim=1)
-    heights = frame_z - data.hit_pos_w[..., 2] - offset
+    hit_z = data.hit_pos_w[..., 2].unflatten(1, (-1, sensor.num_rays_per_frame))
+    heights = (data.frame_pos_w[..., 2:] - hit_z).flatten(1).sub_(offset)
     return heights.masked_fill_(data.distances < 0.0, miss_value)
 
 

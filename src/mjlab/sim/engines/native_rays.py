@@ -18,6 +18,7 @@ import torch
 from mjlab.sim.engines.native_ray_casting import Hits, cast_through
 from mjlab.sim.engines.native_ray_culling import CullingRule
 from mjlab.sim.engines.native_ray_nearby import NearbyRays, cluster_rays
+from mjlab.sim.engines.native_ray_planes import StaticPlanes
 from mjlab.sim.engines.native_ray_tiles import (
     StaticGeoms,
     is_static,
@@ -93,7 +94,10 @@ class NativeRays:
         hits = Hits.empty(len(origins), rays)
         trials = origins.shape[0] * rays * self._model.ngeom
         is_first, plan.is_new = plan.is_new and trials < _MIN_TRIALS, False
-        if is_first or plan.nearby is None or not _STATIC_FIELDS.isdisjoint(expanded):
+        is_shared = _STATIC_FIELDS.isdisjoint(expanded)
+        if plan.planes is not None and is_shared:
+            plan.planes.cast(origins.numpy(), directions.numpy(), hits)
+        elif is_first or plan.nearby is None or not is_shared:
             self._cast_all(plan, origins, directions, hits)
         else:
             self._cast_nearby(plan, origins, directions, max_distances, hits)
@@ -112,6 +116,7 @@ class NativeRays:
         model = self._model
         visible = visible_geoms(model, groups)
         plan = _Plan(groups, excluded, is_one_sided=self._rule.concerns(visible))
+        plan.planes = StaticPlanes.alone(model, self._host, visible, excluded)
         near = visible & is_static(model)
         if near.sum() < _MIN_GEOMS:
             return plan
@@ -242,6 +247,7 @@ class _Plan:
         self.excluded = excluded
         self.is_one_sided = is_one_sided
         self.is_new = True
+        self.planes: StaticPlanes | None = None
         self.nearby: StaticGeoms | None = None
         self.has_moving = False
         self.pause = 0

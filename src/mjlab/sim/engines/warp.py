@@ -40,6 +40,7 @@ from mjlab.sim.engines.warp_rays import WarpRays
 from mjlab.sim.engines.warp_support import (
     UnsupportedByWarpError,
     mocap_bodies,
+    raycast_problem,
     refuse_unsupported,
     rotation_matrices,
     static_geoms,
@@ -139,6 +140,7 @@ class WarpEngine(Engine):
                 f"warp (mujoco_warp {mjwarp.__version__}, Warp {wp.config.version}), "
                 f"device {device}" + ("" if self._on_cuda else ", for testing: slow")
             ),
+            raycast_problem=raycast_problem(model),
         )
         self.create_graph()
 
@@ -420,6 +422,8 @@ class WarpEngine(Engine):
         exclude_body_ids: torch.Tensor | None,
         max_distances: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        if self.capabilities.raycast_problem is not None:
+            raise UnsupportedByWarpError(self.capabilities.raycast_problem)
         if self._rays is None:
             self._rays = WarpRays(self._host.model, self.wp_model, self.wp_data, self._ordered)
         distances, normals, geom_ids = self._rays.cast(

@@ -84,11 +84,6 @@ class WarpRays:
         return self._contexts[key]
 
     def _make_context(self, groups: tuple[int, ...] | None) -> Any:
-        if self._host.nflex:
-            raise ValueError(
-                "MuJoCo Warp cannot cast rays in a model with flexes. Leave out the ray sensors or "
-                "the flexes, or use --engine native (SimulationCfg.engine='native')."
-            )
         # MuJoCo counts a group beyond 0 to 5 as the nearest of these.
         present = np.unique(self._host.geom_group)
         if groups is not None:

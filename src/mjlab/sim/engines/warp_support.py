@@ -75,6 +75,16 @@ def _unsupported_plugins(model: mujoco.MjModel) -> list[str]:
     ]
 
 
+def raycast_problem(model: mujoco.MjModel) -> str | None:
+    """Return why MuJoCo Warp cannot cast rays in a model, and what to do; None if it can."""
+    if not model.nflex:
+        return None
+    return (
+        "MuJoCo Warp cannot cast rays in a model with flexes. Leave out the ray sensors or the "
+        "flexes, or use --engine native (SimulationCfg.engine='native')."
+    )
+
+
 def mocap_bodies(model: mujoco.MjModel) -> list[int]:
     """Return the bodies of the mocap poses, in their order."""
     bodies = [-1] * model.nmocap

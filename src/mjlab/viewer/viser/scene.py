@@ -50,8 +50,9 @@ class MjlabViserScene(ViserMujocoScene):
             site_group: Which site groups are shown at first.
         """
         super().__init__(server, mj_model, num_envs)
-        # As mjviser has them, contact points disappear under a robot's feet.
+        # As mjviser has them, contact points disappear in a robot's feet: discs look out.
         mj_model.vis.scale.contactwidth *= _CONTACT_WIDENING
+        mj_model.vis.scale.contactheight /= _CONTACT_WIDENING
         self.view = view if view is not None else _whole_model_view(mj_model)
         self.geom_groups_visible = [bool(shown) for shown in geom_group]
         self.site_groups_visible = [bool(shown) for shown in site_group]
