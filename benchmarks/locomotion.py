@@ -60,7 +60,12 @@ def recorded_rays(env: ManagerBasedRlEnv) -> list[tuple[Any, ...]]:
 
 
 def measure_case(case: Case) -> Row:
-    """Measure one task. Both loops start from the same states and get the same controls."""
+    """Measure one task.
+
+    The bare loop steps the same models, those of the environments with what their events have
+    randomized, and in each round starts from the states in which the environments are, with the same
+    controls: what a robot does decides what its physics costs.
+    """
     env = make_env(case.task, NUM_ENVS)
     generator = torch.Generator().manual_seed(0)
     shape = (NUM_ENVS, env.action_manager.total_action_dim)
@@ -68,12 +73,18 @@ def measure_case(case: Case) -> Row:
     for _ in range(STEPS_BEFORE):
         env.step(actions)
     bare = BareLoop(env.sim.mj_model, NUM_ENVS, NUM_THREADS, env.cfg.decimation)
-    for name in ("qpos", "qvel", "ctrl"):
-        getattr(bare, name)[:] = getattr(env.sim.data, name).numpy()
+    bare.expand({name: getattr(env.sim.model, name) for name in env.sim.expanded_fields})
+
+    def same_states() -> None:
+        for name in ("qpos", "qvel", "ctrl"):
+            getattr(bare, name)[:] = getattr(env.sim.data, name).numpy()
+
     if case.with_rays:
         for origins, directions, groups, _ in recorded_rays(env):
             bare.cast(origins.numpy(), directions.numpy(), tuple(groups or range(6)))
-    env_time, bare_time = alternate(lambda: env.step(actions), bare, steps=5, repeats=15)
+    env_time, bare_time = alternate(
+        bare, lambda: env.step(actions), steps=5, repeats=21, before=same_states
+    )[::-1]
     ratio = bare_time / env_time
     rays = ", same rays" if case.with_rays else ""
     return Row(

@@ -4,25 +4,34 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import mjbatch
 import mujoco
 import numpy as np
+import torch
 
 Sample = Callable[[], Any]
 
 
 def alternate(
-    *samples: Sample, steps: int = 20, repeats: int = 15, warm_up: int = 5
+    *samples: Sample,
+    steps: int = 20,
+    repeats: int = 15,
+    warm_up: int = 5,
+    before: Sample = lambda: None,
 ) -> list[float]:
-    """Return the median time of each sample, in seconds, taking turns so that noise hits all."""
+    """Return the median time of each sample, in seconds, taking turns so that noise hits all.
+
+    `before` is called before each round of samples, and not timed.
+    """
     for sample in samples:
         for _ in range(warm_up):
             sample()
     times: list[list[float]] = [[] for _ in samples]
     for _ in range(repeats):
+        before()
         for sample, taken in zip(samples, times, strict=True):
             begin = time.perf_counter()
             for _ in range(steps):
@@ -46,6 +55,12 @@ class BareLoop:
         self.qpos, self.ctrl = self._batch.bind("qpos"), self._batch.bind("ctrl")
         self.qvel = self._batch.bind("qvel")
         self._rays: list[dict[str, np.ndarray]] = []
+
+    def expand(self, fields: Mapping[str, torch.Tensor]) -> None:
+        """Give every simulation its own values (num_envs, ...) of these model fields."""
+        for name, values in fields.items():
+            own = self._batch.expand(name)
+            own[:] = values.numpy().reshape(own.shape)
 
     def cast(self, origins: np.ndarray, directions: np.ndarray, groups: tuple[int, ...]) -> None:
         """Cast these rays (num_envs, R, 3), in geoms of these groups, at the end of every step."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import socket
+from collections.abc import Iterator
 
 # Tests run several processes at a time; one thread each keeps them from fighting over the cores.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -27,3 +29,16 @@ def gl() -> None:
         open_renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
     except RenderingUnavailableError as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture
+def viser_server() -> Iterator:
+    """A page's server on a free port of this machine."""
+    import viser
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
+    yield server
+    server.stop()

@@ -10,16 +10,20 @@ import numpy as np
 import pytest
 import torch
 from robot_drawing import drawing_differences
-from robot_figures import VISUAL_GROUP, differences, load_table
+from robot_figures import differences, load_table
+from robot_scenes import (
+    check_drawing_changes_nothing,
+    compiled,
+    place,
+    scene_of,
+    turn_on_its_side,
+)
 
 import mjlab
 from mjlab import compat
 from mjlab.asset_zoo.robots import get_g1_robot_cfg
 from mjlab.asset_zoo.robots.unitree_g1 import g1_constants as g1
-from mjlab.entity import Entity, EntityCfg
-from mjlab.scene import Scene, SceneCfg
-from mjlab.sim import MujocoCfg, Simulation, SimulationCfg
-from mjlab.terrains import TerrainEntityCfg
+from mjlab.sim import MujocoCfg
 
 TABLE = load_table("unitree_g1")
 FEET = [f"{side}_foot{i}_collision" for side in ("left", "right") for i in range(1, 8)]
@@ -68,10 +72,7 @@ ACTION_SCALES = {
 
 
 def built(**changes) -> mujoco.MjModel:
-    cfg = get_g1_robot_cfg()
-    for field, value in changes.items():
-        setattr(cfg, field, value)
-    return cfg.build().spec.compile()
+    return compiled(get_g1_robot_cfg(), **changes)
 
 
 def motor_of(joint: str) -> str:
@@ -259,31 +260,14 @@ def test_a_config_that_a_task_changes_leaves_the_next_one_as_it_was():
 # In the simulation.
 
 
-def scene_of(cfg: EntityCfg, num_envs: int = 1) -> tuple[Scene, Simulation]:
-    scene = Scene(
-        SceneCfg(num_envs=num_envs, entities={"robot": cfg}, terrain=TerrainEntityCfg()),
-        device="cpu",
-    )
-    sim_cfg = SimulationCfg(engine="native", mujoco=MUJOCO)
-    sim = Simulation(num_envs, sim_cfg, model=scene.compile(), device="cpu")
-    scene.initialize(sim.mj_model, sim.model, sim.data)
-    return scene, sim
-
-
 @pytest.mark.parametrize("keyframe", KEYFRAMES)
 def test_it_stands_for_a_second_at_its_pose(keyframe):
     # Nobody balances it: the springs of the ankles are softer than gravity, so that it leans ever
     # further, but slowly.
     cfg = get_g1_robot_cfg()
     cfg.init_state = KEYFRAMES[keyframe]
-    scene, sim = scene_of(cfg, num_envs=2)
-    robot: Entity = scene["robot"]
-    robot.set_joint_position_target(robot.data.default_joint_pos)
-    root = robot.data.default_root_state.clone()
-    root[:, :3] += scene.env_origins
-    robot.write_root_state_to_sim(root)
-    robot.write_joint_state_to_sim(robot.data.default_joint_pos, robot.data.default_joint_vel)
-    scene.write_data_to_sim()
+    scene, sim = scene_of(cfg, MUJOCO, num_envs=2)
+    robot = place(scene)
     start = cfg.init_state.pos[2]
     for sunk, upright in ((0.04, 0.998), (0.13, 0.93)):
         sim.step(nstep=100)
@@ -294,14 +278,12 @@ def test_it_stands_for_a_second_at_its_pose(keyframe):
 
 
 def test_its_sensors_work_inside_a_scene():
-    _, sim = scene_of(get_g1_robot_cfg())
+    _, sim = scene_of(get_g1_robot_cfg(), MUJOCO)
     model = sim.mj_model
     assert [model.sensor(i).name for i in range(model.nsensor)] == [
         f"robot/{sensor['name']}" for sensor in TABLE["sensors"]
     ]
-    # A quarter turn to the left about x: the robot's y axis points up.
-    sim.data.qpos[:] = torch.tensor(model.key_qpos[0], dtype=torch.float32)
-    sim.data.qpos[0, 3:7] = torch.tensor([0.5**0.5, 0.5**0.5, 0, 0])
+    turn_on_its_side(sim)
     sim.data.qvel[0, 3] = 0.5
     sim.forward()
 
@@ -320,36 +302,9 @@ def test_its_sensors_work_inside_a_scene():
     assert 1.0 < float(reading("root_angmom")[0]) < 3.0
 
 
-def without_drawing() -> mujoco.MjSpec:
-    spec = g1.get_spec()
-    for geom in list(spec.geoms):
-        if geom.group == VISUAL_GROUP:
-            spec.delete(geom)
-    return spec
-
-
 def test_what_is_drawn_changes_neither_masses_nor_contacts():
-    bare = get_g1_robot_cfg()
-    bare.spec_fn = without_drawing
-    models = [scene_of(cfg)[1].mj_model for cfg in (get_g1_robot_cfg(), bare)]
-    assert models[0].ngeom > models[1].ngeom + 60
-    for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_invweight0"):
-        np.testing.assert_array_equal(getattr(models[0], field), getattr(models[1], field))
-    ends = []
-    for model in models:
-        # Lying on its back, so that much of it touches the ground.
-        data = mujoco.MjData(model)
-        mujoco.mj_resetDataKeyframe(model, data, 0)
-        data.qpos[2:7] = [0.2, 0.5**0.5, 0, -(0.5**0.5), 0]
-        mujoco.mj_step(model, data, nstep=200)
-        names = [
-            (model.geom(contact.geom1).name, model.geom(contact.geom2).name)
-            for contact in data.contact[: data.ncon]
-        ]
-        ends.append((names, data.qpos.copy()))
-    assert ends[0][0] == ends[1][0]
-    assert ends[0][0]
-    np.testing.assert_array_equal(ends[0][1], ends[1][1])
+    on_its_back = dict(enumerate([0.2, 0.5**0.5, 0, -(0.5**0.5), 0], start=2))
+    check_drawing_changes_nothing(get_g1_robot_cfg(), MUJOCO, on_its_back, at_least=61)
 
 
 # The package.

@@ -11,16 +11,20 @@ import numpy as np
 import pytest
 import torch
 from robot_drawing import drawing_differences
-from robot_figures import VISUAL_GROUP, differences, load_table
+from robot_figures import differences, load_table
+from robot_scenes import (
+    check_drawing_changes_nothing,
+    compiled,
+    place,
+    scene_of,
+    turn_on_its_side,
+)
 
 import mjlab
 from mjlab import compat
 from mjlab.asset_zoo.robots import get_go1_robot_cfg
 from mjlab.asset_zoo.robots.unitree_go1 import go1_constants as go1
-from mjlab.entity import Entity
-from mjlab.scene import Scene, SceneCfg
-from mjlab.sim import MujocoCfg, Simulation, SimulationCfg
-from mjlab.terrains import TerrainEntityCfg
+from mjlab.sim import MujocoCfg
 
 TABLE = load_table("unitree_go1")
 FEET = [f"{leg}_foot_collision" for leg in ("FR", "FL", "RR", "RL")]
@@ -29,10 +33,7 @@ MUJOCO = MujocoCfg(timestep=0.005, impratio=10, cone="elliptic", iterations=10, 
 
 
 def built(**changes) -> mujoco.MjModel:
-    cfg = get_go1_robot_cfg()
-    for field, value in changes.items():
-        setattr(cfg, field, value)
-    return cfg.build().spec.compile()
+    return compiled(get_go1_robot_cfg(), **changes)
 
 
 def test_every_figure_is_that_of_the_table():
@@ -149,29 +150,10 @@ def test_a_config_that_a_task_changes_leaves_the_next_one_as_it_was():
 # In the simulation.
 
 
-def scene_of(cfg, num_envs: int = 1) -> tuple[Scene, Simulation]:
-    scene = Scene(
-        SceneCfg(num_envs=num_envs, entities={"robot": cfg}, terrain=TerrainEntityCfg()),
-        device="cpu",
-    )
-    sim_cfg = SimulationCfg(engine="native", mujoco=MUJOCO)
-    sim = Simulation(num_envs, sim_cfg, model=scene.compile(), device="cpu")
-    scene.initialize(sim.mj_model, sim.model, sim.data)
-    return scene, sim
-
-
 def test_it_stands_for_two_seconds_at_its_home_pose():
-    scene, sim = scene_of(get_go1_robot_cfg(), num_envs=2)
-    robot: Entity = scene["robot"]
-    robot.set_joint_position_target(robot.data.default_joint_pos)
-    lift = torch.tensor([0.01, 0.05])
-    root = robot.data.default_root_state.clone()
-    # Where and how high resets of the velocity tasks put it.
-    root[:, :3] += scene.env_origins
-    root[:, 2] += lift
-    robot.write_root_state_to_sim(root)
-    robot.write_joint_state_to_sim(robot.data.default_joint_pos, robot.data.default_joint_vel)
-    scene.write_data_to_sim()
+    scene, sim = scene_of(get_go1_robot_cfg(), MUJOCO, num_envs=2)
+    # At heights at which resets of the velocity tasks put it.
+    robot = place(scene, lift=torch.tensor([0.01, 0.05]))
     for step in range(400):
         sim.step()
         if step >= 100:
@@ -183,14 +165,12 @@ def test_it_stands_for_two_seconds_at_its_home_pose():
 
 
 def test_its_sensors_work_inside_a_scene():
-    scene, sim = scene_of(get_go1_robot_cfg())
+    _, sim = scene_of(get_go1_robot_cfg(), MUJOCO)
     model = sim.mj_model
     assert [model.sensor(i).name for i in range(model.nsensor)] == [
         f"robot/{sensor['name']}" for sensor in TABLE["sensors"]
     ]
-    # A quarter turn to the left about x: the robot's y axis points up.
-    sim.data.qpos[:] = torch.tensor(model.key_qpos[0], dtype=torch.float32)
-    sim.data.qpos[0, 3:7] = torch.tensor([0.5**0.5, 0.5**0.5, 0, 0])
+    turn_on_its_side(sim)
     sim.forward()
     address = model.sensor("robot/imu_upvector").adr[0]
     up = sim.data.sensordata[0, address : address + 3]
@@ -198,34 +178,8 @@ def test_its_sensors_work_inside_a_scene():
 
 
 def test_what_is_drawn_changes_neither_masses_nor_contacts():
-    def without_drawing() -> mujoco.MjSpec:
-        spec = go1.get_spec()
-        for geom in list(spec.geoms):
-            if geom.group == VISUAL_GROUP:
-                spec.delete(geom)
-        return spec
-
-    bare = get_go1_robot_cfg()
-    bare.spec_fn = without_drawing
-    models = [scene_of(cfg)[1].mj_model for cfg in (get_go1_robot_cfg(), bare)]
-    assert models[0].ngeom > models[1].ngeom + 30
-    for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_invweight0"):
-        np.testing.assert_array_equal(getattr(models[0], field), getattr(models[1], field))
-    ends = []
-    for model in models:
-        # On its side, so that legs and body touch the ground and one another.
-        data = mujoco.MjData(model)
-        mujoco.mj_resetDataKeyframe(model, data, 0)
-        data.qpos[3:7] = [0.5**0.5, 0.5**0.5, 0, 0]
-        mujoco.mj_step(model, data, nstep=200)
-        names = [
-            (model.geom(contact.geom1).name, model.geom(contact.geom2).name)
-            for contact in data.contact[: data.ncon]
-        ]
-        ends.append((names, data.qpos.copy()))
-    assert ends[0][0] == ends[1][0]
-    assert ends[0][0]
-    np.testing.assert_array_equal(ends[0][1], ends[1][1])
+    on_its_side = dict(enumerate([0.5**0.5, 0.5**0.5, 0, 0], start=3))
+    check_drawing_changes_nothing(get_go1_robot_cfg(), MUJOCO, on_its_side, at_least=31)
 
 
 # The package.

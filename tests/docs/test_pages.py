@@ -51,6 +51,7 @@ def test_flags_are_fields_of_the_commands() -> None:
     from mjlab.scripts.play import PlayConfig
     from mjlab.scripts.profile_env import ProfileConfig
     from mjlab.scripts.train import TrainConfig
+    from mjlab.scripts.visualize_terrain import VisualizeTerrainConfig
 
     def exists(config: object, path: list[str]) -> bool:
         if not path:
@@ -63,7 +64,7 @@ def test_flags_are_fields_of_the_commands() -> None:
         return exists(getattr(config, name), path[1:])
 
     train = TrainConfig.from_task("Mjlab-Cartpole-Swingup")
-    configs = (train, PlayConfig(), EvaluateConfig(), ProfileConfig())
+    configs = (train, PlayConfig(), EvaluateConfig(), ProfileConfig(), VisualizeTerrainConfig())
     unknown = set()
     for page in PAGES:
         for flag in _FLAG.findall(_code(page.read_text(encoding="utf-8"))):

@@ -6,12 +6,19 @@ import contextlib
 import importlib
 import io
 import logging
+import os
+import signal
+import subprocess
 import sys
+import time
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
+
+from mjlab.scripts.run_folder import checkpoints_in, read_run_info
 
 TASK = "Mjlab-Cartpole-Swingup"
 SMALL = [
@@ -74,3 +81,28 @@ def run_script(script: str, *argv: str) -> Outcome:
         sys.argv = before
     assert isinstance(status, int)
     return Outcome(status, out.getvalue(), err.getvalue())
+
+
+def interrupt_training(command: list[str], log_root: Path, patience: float = 60.0) -> str:
+    """Press Ctrl-C once a training run in `log_root` has a checkpoint; return what was printed.
+
+    Checks that the run ended well and saved once, with what it had learned by then. `patience` is
+    in seconds.
+    """
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, process_group=0
+    )
+    end = time.monotonic() + patience
+    while not list(log_root.glob("cartpole/*/model_0.pt")) and time.monotonic() < end:
+        assert process.poll() is None, process.communicate()[0]
+        time.sleep(0.02)
+    # As a terminal does it: to the whole process group.
+    os.killpg(process.pid, signal.SIGINT)
+    out = process.communicate(timeout=patience)[0]
+    assert process.returncode == 0, out
+    assert out.count("SIGINT: finishing this iteration, then saving") == 1
+    (run_dir,) = (log_root / "cartpole").iterdir()
+    info = read_run_info(run_dir)
+    assert info["ended"] == "interrupted"
+    assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"
+    return out

@@ -7,11 +7,10 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 import torch
-from commands import TASK
+from commands import TASK, interrupt_training
 from process_runs import SMALL, Ended, ProcessRun
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -203,23 +202,4 @@ def test_the_launcher_trains_and_ctrl_c_saves_once(tmp_path):
         "run_command(lambda argv: launch_workers(train_command(argv[0], argv[1:]), 2))\n"
     )
     flags = [TASK, *SMALL, "--log-root", str(tmp_path), "--agent.max-iterations", "1000000"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", program, *flags],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        process_group=0,
-    )
-    end = time.monotonic() + 120
-    while not list(Path(tmp_path).glob("cartpole/*/model_0.pt")) and time.monotonic() < end:
-        assert process.poll() is None, process.communicate()[0]
-        time.sleep(0.02)
-    # As a terminal does it: to the whole process group.
-    os.killpg(process.pid, signal.SIGINT)
-    out = process.communicate(timeout=120)[0]
-    assert process.returncode == 0, out
-    assert out.count("SIGINT: finishing this iteration, then saving") == 1
-    (run_dir,) = (tmp_path / "cartpole").iterdir()
-    info = read_run_info(run_dir)
-    assert info["ended"] == "interrupted"
-    assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"
+    interrupt_training([sys.executable, "-c", program, *flags], tmp_path, patience=120.0)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
 import time
 
 import pytest
-from commands import SMALL
+from commands import SMALL, interrupt_training
 
-from mjlab.scripts.run_folder import checkpoints_in, read_run_info, write_run_info
+from mjlab.scripts.run_folder import write_run_info
 
 TASK = "Mjlab-Cartpole-Swingup"
 
@@ -119,23 +118,8 @@ def test_ctrl_c_saves_the_running_seed_and_ends_the_series(tmp_path):
     command = [sys.executable, "-m", "mjlab.scripts.train_seeds", TASK, *SMALL[:-4]]
     command += ["--log-root", str(tmp_path), "--agent.max-iterations", "1000000", "--seeds=2"]
     command += ["--agent.save-interval", "1"]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, process_group=0
-    )
-    end = time.monotonic() + 60
-    while not list(tmp_path.glob("cartpole/*/model_0.pt")) and time.monotonic() < end:
-        assert process.poll() is None, process.communicate()[0]
-        time.sleep(0.02)
-    # As a terminal does it: to the whole process group.
-    os.killpg(process.pid, signal.SIGINT)
-    out = process.communicate(timeout=60)[0]
-    assert process.returncode == 0, out
-    assert out.count("SIGINT: finishing this iteration, then saving") == 1
+    out = interrupt_training(command, tmp_path)
     assert "Stopped during seed 1 of 2" in out
-    (run_dir,) = (tmp_path / "cartpole").iterdir()
-    info = read_run_info(run_dir)
-    assert info["ended"] == "interrupted"
-    assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"
 
 
 @pytest.mark.parametrize(("ended", "seeds"), [("interrupted", 1), ("finished", 3)])

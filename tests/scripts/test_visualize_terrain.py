@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import socket
 import subprocess
 import sys
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -16,18 +14,6 @@ from mjlab.scripts.terrain_page import TerrainPage
 from mjlab.scripts.terrain_scene import build_terrain_scene
 from mjlab.scripts.visualize_terrain import VisualizeTerrainConfig, run_visualize_terrain
 from mjlab.terrains.config import ALL_TERRAIN_PRESETS, flat, hf_pyramid_slope, wave_terrain
-
-
-@pytest.fixture
-def server() -> Iterator:
-    import viser
-
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
-    yield server
-    server.stop()
 
 
 @pytest.mark.parametrize("name", ALL_TERRAIN_PRESETS)
@@ -72,8 +58,8 @@ def test_polygons_are_counted():
     assert scene.num_polygons == 2 * 2 * 79 * 79 + 4 * 12
 
 
-def test_the_page_shows_what_its_controls_say(server):
-    page = TerrainPage(server, "wave_terrain", num_levels=2, robot="none")
+def test_the_page_shows_what_its_controls_say(viser_server):
+    page = TerrainPage(viser_server, "wave_terrain", num_levels=2, robot="none")
     page.rebuild()
     assert page.status.startswith("1 x 2 terrains")
     low = page.scene.model.hfield_size[1, 2]
@@ -86,14 +72,14 @@ def test_the_page_shows_what_its_controls_say(server):
     assert page._handles == {}
 
 
-def test_all_presets_are_shown_side_by_side(server):
-    page = TerrainPage(server, "all", num_levels=1, robot="none")
+def test_all_presets_are_shown_side_by_side(viser_server):
+    page = TerrainPage(viser_server, "all", num_levels=1, robot="none")
     page.rebuild()
     assert page.scene.origins.shape == (1, len(ALL_TERRAIN_PRESETS), 3)
 
 
-def test_a_terrain_that_cannot_be_built_is_told_on_the_page_and_the_last_one_stays(server):
-    page = TerrainPage(server, "wave_terrain", num_levels=1, size=4.0, robot="none")
+def test_a_terrain_that_cannot_be_built_is_told_on_the_page_and_the_last_one_stays(viser_server):
+    page = TerrainPage(viser_server, "wave_terrain", num_levels=1, size=4.0, robot="none")
     page.rebuild()
     last = page.scene
     page._handles["border_width"].value = 0.05

@@ -158,7 +158,7 @@ def checkboxes(server) -> list:
 def test_contact_points_are_wider_than_mjviser_draws_them(viser_server) -> None:
     viewer = make(viser_server)
     authored = viewer.env.sim.mj_model.vis.scale.contactwidth
-    assert viewer.scene.mj_model.vis.scale.contactwidth > 2 * authored
+    assert viewer.scene.mj_model.vis.scale.contactwidth > 1.5 * authored
 
 
 def test_commands_hear_of_pauses_and_gui_resets(viser_server) -> None:

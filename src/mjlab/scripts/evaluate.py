@@ -31,18 +31,9 @@ def __getattr__(name: str) -> Any:
 def _command(argv: list[str]) -> None:
     task, flags = task_and_flags(argv, _USAGE)
     from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
-    from mjlab.scripts.policy import policy_env_cfg, profile_of_policy
-    from mjlab.scripts.profiles import parse_with_profile
+    from mjlab.scripts.policy import parse_policy_flags
 
-    cfg = parse_with_profile(
-        lambda profile: EvaluateConfig(
-            env=policy_env_cfg(task, profile, play=False), profile=profile
-        ),
-        lambda cfg: profile_of_policy(task, cfg),
-        flags,
-        prog=f"evaluate {task}",
-    )
-    run_evaluate(task, cfg)
+    run_evaluate(task, parse_policy_flags(EvaluateConfig, flags, task, "evaluate", play=False))
 
 
 def main() -> None:

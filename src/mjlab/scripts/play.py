@@ -33,16 +33,9 @@ def __getattr__(name: str) -> Any:
 def _command(argv: list[str]) -> None:
     task, flags = task_and_flags(argv, _USAGE)
     from mjlab.scripts.play_run import PlayConfig, run_play
-    from mjlab.scripts.policy import policy_env_cfg, profile_of_policy
-    from mjlab.scripts.profiles import parse_with_profile
+    from mjlab.scripts.policy import parse_policy_flags
 
-    cfg = parse_with_profile(
-        lambda profile: PlayConfig(env=policy_env_cfg(task, profile, play=True), profile=profile),
-        lambda cfg: profile_of_policy(task, cfg),
-        flags,
-        prog=f"play {task}",
-    )
-    run_play(task, cfg)
+    run_play(task, parse_policy_flags(PlayConfig, flags, task, "play", play=True))
 
 
 def main() -> None:

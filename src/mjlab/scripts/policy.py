@@ -6,11 +6,11 @@ import copy
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.scripts.cli import UserError, tell
-from mjlab.scripts.profiles import profile_of_run
+from mjlab.scripts.profiles import parse_with_profile, profile_of_run
 from mjlab.scripts.run_folder import named_checkpoint, newest_checkpoint, read_agent_params
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 
@@ -52,6 +52,32 @@ class PolicyFlags:
     """Named settings of the task, such as `cpu`. None: those that the policy was trained with."""
     env: ManagerBasedRlEnvCfg | None = None
     """The environment; None takes the task's config."""
+
+
+F = TypeVar("F", bound=PolicyFlags)
+
+
+def parse_policy_flags(
+    kind: type[F], flags: list[str], task: str, command: str, *, play: bool
+) -> F:
+    """Return what `flags` make of the defaults of `kind`, under the profile of the policy they name.
+
+    Args:
+        kind: The flags of `command`.
+        flags: The command line, after the task.
+        task: Name of the task.
+        command: The command, for messages.
+        play: Whether the environment is the task's own to play with, or to train with.
+
+    Raises:
+        UnknownProfileError: the task has no such profile.
+    """
+    return parse_with_profile(
+        lambda profile: kind(env=policy_env_cfg(task, profile, play=play), profile=profile),
+        lambda cfg: profile_of_policy(task, cfg),
+        flags,
+        prog=f"{command} {task}",
+    )
 
 
 def make_policy(

@@ -30,19 +30,10 @@ def __getattr__(name: str) -> Any:
 
 def _command(argv: list[str]) -> None:
     task, flags = task_and_flags(argv, _USAGE)
-    from mjlab.scripts.policy import policy_env_cfg, profile_of_policy
+    from mjlab.scripts.policy import parse_policy_flags
     from mjlab.scripts.profile_env_run import ProfileConfig, run_profile_env
-    from mjlab.scripts.profiles import parse_with_profile
 
-    cfg = parse_with_profile(
-        lambda profile: ProfileConfig(
-            env=policy_env_cfg(task, profile, play=False), profile=profile
-        ),
-        lambda cfg: profile_of_policy(task, cfg),
-        flags,
-        prog=f"profile-env {task}",
-    )
-    run_profile_env(task, cfg)
+    run_profile_env(task, parse_policy_flags(ProfileConfig, flags, task, "profile-env", play=False))
 
 
 def main() -> None:

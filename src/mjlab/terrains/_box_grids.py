@@ -199,8 +199,7 @@ class BoxTiltedGridTerrainCfg(SubTerrainCfg):
         boxes = Boxes(spec, self.size)
         grid = _lay_out(self, boxes.center)
         dark, bottom = frame_color(GREEN), -self.floor_depth
-        boxes.add_frame(grid.frame, _TILTED_HEIGHT, dark, bottom=bottom)
-        boxes.add_pit_floor(self.floor_depth)
+        boxes.add_pit(grid.frame, _TILTED_HEIGHT, dark, self.floor_depth)
         platform = (self.platform_width, self.platform_width)
         boxes.add_platform(platform, _TILTED_HEIGHT, dark, bottom=bottom)
         name = asset_name(spec, "tilted_column")

@@ -144,6 +144,9 @@ class Boxes:
         """Add a box in the middle."""
         self.add(self.center, extent, top, color, bottom=bottom)
 
-    def add_pit_floor(self, depth: float) -> None:
-        """Add the black floor of a pit under the whole sub-terrain."""
+    def add_pit(
+        self, width: float | tuple[float, float], top: float, color: RGBA, depth: float
+    ) -> None:
+        """Add a pit over the whole sub-terrain: its black floor, and the frame down to there."""
+        self.add_frame(width, top, color, bottom=-depth)
         self.add_platform(self.size, -depth, (0.1, 0.1, 0.1, 1.0))

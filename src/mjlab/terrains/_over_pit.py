@@ -67,8 +67,7 @@ class BoxSteppingStonesTerrainCfg(SubTerrainCfg):
         pitch = inner / (counts - 1)
         reach = self._platform_reach(side, inner, counts, pitch)
         dark, bottom = frame_color(GREEN), -self.floor_depth
-        boxes.add_frame(self.border_width, self.stone_height, dark, bottom=bottom)
-        boxes.add_pit_floor(self.floor_depth)
+        boxes.add_pit(self.border_width, self.stone_height, dark, self.floor_depth)
         platform = (2.0 * float(reach[0]), 2.0 * float(reach[1]))
         boxes.add_platform(platform, self.stone_height, dark, bottom=bottom)
         for i in range(counts[0]):
@@ -154,8 +153,7 @@ class BoxNarrowBeamsTerrainCfg(SubTerrainCfg):
             chord = 2.0 * math.sqrt(2.0) * math.sin(math.pi / self.num_beams)
             radius = min(radius, width / chord)
         dark, bottom, top = frame_color(BLUE), -self.floor_depth, self.beam_height
-        boxes.add_frame(self.border_width, top, dark, bottom=bottom)
-        boxes.add_pit_floor(self.floor_depth)
+        boxes.add_pit(self.border_width, top, dark, self.floor_depth)
         boxes.add_platform((2.0 * radius, 2.0 * radius), top, dark, bottom=bottom)
         for index in range(self.num_beams):
             angle = 2.0 * math.pi * index / self.num_beams
@@ -221,8 +219,7 @@ class BoxNestedRingsTerrainCfg(SubTerrainCfg):
         width = lerp(self.ring_width_range[::-1], difficulty)
         gap = lerp(self.gap_range, difficulty)
         dark, bottom, top = frame_color(BLUE), -self.floor_depth, sum(self.height_range) / 2
-        boxes.add_frame(self.border_width, top, dark, bottom=bottom)
-        boxes.add_pit_floor(self.floor_depth)
+        boxes.add_pit(self.border_width, top, dark, self.floor_depth)
         outer, ring = inset(self.size, self.border_width), 0
         while ring < self.num_rings and min(outer) > self.platform_width:
             shade = brand_ramp(BLUE, ring / max(self.num_rings - 1, 1))

@@ -18,7 +18,7 @@ from mjlab.viewer.viser.variants import GeomVariants
 
 _FOV_RANGE = (20, 150)
 _DEFAULT_FOV = 60.0
-_CONTACT_WIDENING = 5.0
+_CONTACT_WIDENING = 4.2
 
 
 class MjlabViserScene(ViserMujocoScene):
@@ -50,9 +50,8 @@ class MjlabViserScene(ViserMujocoScene):
             site_group: Which site groups are shown at first.
         """
         super().__init__(server, mj_model, num_envs)
-        # As mjviser has them, contact points disappear in a robot's feet: discs look out.
+        # As mjviser has them, contact points disappear in a robot's feet.
         mj_model.vis.scale.contactwidth *= _CONTACT_WIDENING
-        mj_model.vis.scale.contactheight /= _CONTACT_WIDENING
         self.view = view if view is not None else _whole_model_view(mj_model)
         self.geom_groups_visible = [bool(shown) for shown in geom_group]
         self.site_groups_visible = [bool(shown) for shown in site_group]

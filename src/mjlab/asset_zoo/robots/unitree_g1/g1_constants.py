@@ -18,7 +18,9 @@ from pathlib import Path
 
 import mujoco
 
-from mjlab.actuator import BuiltinPositionActuatorCfg
+from mjlab.asset_zoo.robots._motors import DAMPING_RATIO as DAMPING_RATIO
+from mjlab.asset_zoo.robots._motors import NATURAL_FREQ as NATURAL_FREQ
+from mjlab.asset_zoo.robots._motors import action_scale, gains, position_actuator
 from mjlab.compat import older_names
 from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
 from mjlab.utils.actuator import ElectricActuator, reflected_inertia_from_two_stage_planetary
@@ -73,75 +75,36 @@ ACTUATOR_4010 = ElectricActuator(
 
 # Gains.
 
-NATURAL_FREQ = 10 * 2.0 * 3.1415926535
-"""Natural frequency of the joints, 10 Hz in rad/s. (Policies are trained with pi as it is here.)"""
-DAMPING_RATIO = 2.0
-"""Damping ratio of the joints; more than 1 creeps towards the target and never overshoots."""
+STIFFNESS_5020, DAMPING_5020 = gains(ARMATURE_5020)
+STIFFNESS_7520_14, DAMPING_7520_14 = gains(ARMATURE_7520_14)
+STIFFNESS_7520_22, DAMPING_7520_22 = gains(ARMATURE_7520_22)
+STIFFNESS_4010, DAMPING_4010 = gains(ARMATURE_4010)
 
-STIFFNESS_5020 = ARMATURE_5020 * NATURAL_FREQ**2
-STIFFNESS_7520_14 = ARMATURE_7520_14 * NATURAL_FREQ**2
-STIFFNESS_7520_22 = ARMATURE_7520_22 * NATURAL_FREQ**2
-STIFFNESS_4010 = ARMATURE_4010 * NATURAL_FREQ**2
-
-DAMPING_5020 = 2.0 * DAMPING_RATIO * ARMATURE_5020 * NATURAL_FREQ
-DAMPING_7520_14 = 2.0 * DAMPING_RATIO * ARMATURE_7520_14 * NATURAL_FREQ
-DAMPING_7520_22 = 2.0 * DAMPING_RATIO * ARMATURE_7520_22 * NATURAL_FREQ
-DAMPING_4010 = 2.0 * DAMPING_RATIO * ARMATURE_4010 * NATURAL_FREQ
-
-G1_ACTUATOR_5020 = BuiltinPositionActuatorCfg(
-    target_names_expr=(
+G1_ACTUATOR_5020 = position_actuator(
+    ACTUATOR_5020,
+    (
         ".*_elbow_joint",
         ".*_shoulder_pitch_joint",
         ".*_shoulder_roll_joint",
         ".*_shoulder_yaw_joint",
         ".*_wrist_roll_joint",
     ),
-    stiffness=STIFFNESS_5020,
-    damping=DAMPING_5020,
-    effort_limit=ACTUATOR_5020.effort_limit,
-    armature=ACTUATOR_5020.reflected_inertia,
 )
-G1_ACTUATOR_7520_14 = BuiltinPositionActuatorCfg(
-    target_names_expr=(".*_hip_pitch_joint", ".*_hip_yaw_joint", "waist_yaw_joint"),
-    stiffness=STIFFNESS_7520_14,
-    damping=DAMPING_7520_14,
-    effort_limit=ACTUATOR_7520_14.effort_limit,
-    armature=ACTUATOR_7520_14.reflected_inertia,
+G1_ACTUATOR_7520_14 = position_actuator(
+    ACTUATOR_7520_14, (".*_hip_pitch_joint", ".*_hip_yaw_joint", "waist_yaw_joint")
 )
-G1_ACTUATOR_7520_22 = BuiltinPositionActuatorCfg(
-    target_names_expr=(".*_hip_roll_joint", ".*_knee_joint"),
-    stiffness=STIFFNESS_7520_22,
-    damping=DAMPING_7520_22,
-    effort_limit=ACTUATOR_7520_22.effort_limit,
-    armature=ACTUATOR_7520_22.reflected_inertia,
-)
-G1_ACTUATOR_4010 = BuiltinPositionActuatorCfg(
-    target_names_expr=(".*_wrist_pitch_joint", ".*_wrist_yaw_joint"),
-    stiffness=STIFFNESS_4010,
-    damping=DAMPING_4010,
-    effort_limit=ACTUATOR_4010.effort_limit,
-    armature=ACTUATOR_4010.reflected_inertia,
-)
+G1_ACTUATOR_7520_22 = position_actuator(ACTUATOR_7520_22, (".*_hip_roll_joint", ".*_knee_joint"))
+G1_ACTUATOR_4010 = position_actuator(ACTUATOR_4010, (".*_wrist_pitch_joint", ".*_wrist_yaw_joint"))
 
 # Waist and ankle are four-bar linkages: two 5020 side by side move pitch when they turn together
 # and roll when they turn against each other. The model has a serial chain instead. At the nominal
 # pose each of its two joints sees both motors, hence twice the inertia, gains and torque; away from
 # it the true figures depend on the angles.
-_PARALLEL_MOTORS = 2
-
-G1_ACTUATOR_WAIST = BuiltinPositionActuatorCfg(
-    target_names_expr=("waist_pitch_joint", "waist_roll_joint"),
-    stiffness=STIFFNESS_5020 * _PARALLEL_MOTORS,
-    damping=DAMPING_5020 * _PARALLEL_MOTORS,
-    effort_limit=ACTUATOR_5020.effort_limit * _PARALLEL_MOTORS,
-    armature=ACTUATOR_5020.reflected_inertia * _PARALLEL_MOTORS,
+G1_ACTUATOR_WAIST = position_actuator(
+    ACTUATOR_5020, ("waist_pitch_joint", "waist_roll_joint"), motors=2
 )
-G1_ACTUATOR_ANKLE = BuiltinPositionActuatorCfg(
-    target_names_expr=(".*_ankle_pitch_joint", ".*_ankle_roll_joint"),
-    stiffness=STIFFNESS_5020 * _PARALLEL_MOTORS,
-    damping=DAMPING_5020 * _PARALLEL_MOTORS,
-    effort_limit=ACTUATOR_5020.effort_limit * _PARALLEL_MOTORS,
-    armature=ACTUATOR_5020.reflected_inertia * _PARALLEL_MOTORS,
+G1_ACTUATOR_ANKLE = position_actuator(
+    ACTUATOR_5020, (".*_ankle_pitch_joint", ".*_ankle_roll_joint"), motors=2
 )
 
 _ACTUATORS = (
@@ -155,14 +118,7 @@ _ACTUATORS = (
 G1_ARTICULATION = EntityArticulationInfoCfg(actuators=_ACTUATORS, soft_joint_pos_limit_factor=0.9)
 """All actuators."""
 
-# An action of one is a quarter of the angle at which the spring alone gives the effort limit.
-_ACTION_EFFORT_SHARE = 0.25
-G1_ACTION_SCALE: dict[str, float] = {
-    pattern: _ACTION_EFFORT_SHARE * actuator.effort_limit / actuator.stiffness
-    for actuator in _ACTUATORS
-    if actuator.effort_limit is not None
-    for pattern in actuator.target_names_expr
-}
+G1_ACTION_SCALE = action_scale(_ACTUATORS)
 """Scale of joint position actions by joint pattern, rad per unit of action."""
 
 # Keyframes.

@@ -17,7 +17,9 @@ from pathlib import Path
 
 import mujoco
 
-from mjlab.actuator import BuiltinPositionActuatorCfg
+from mjlab.asset_zoo.robots._motors import DAMPING_RATIO as DAMPING_RATIO
+from mjlab.asset_zoo.robots._motors import NATURAL_FREQ as NATURAL_FREQ
+from mjlab.asset_zoo.robots._motors import action_scale, gains, position_actuator
 from mjlab.compat import older_names
 from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
 from mjlab.utils.actuator import ElectricActuator, reflected_inertia
@@ -57,49 +59,20 @@ KNEE_ACTUATOR = ElectricActuator(
 
 # Gains.
 
-NATURAL_FREQ = 10 * 2.0 * 3.1415926535
-"""Natural frequency of the joints, 10 Hz in rad/s. (Policies are trained with pi as it is here.)"""
-DAMPING_RATIO = 2.0
-"""Damping ratio of the joints; more than 1 creeps towards the target and never overshoots."""
+STIFFNESS_HIP, DAMPING_HIP = gains(HIP_ACTUATOR.reflected_inertia)
+"""Gains of the hip and thigh joints, N m/rad and N m s/rad."""
+STIFFNESS_KNEE, DAMPING_KNEE = gains(KNEE_ACTUATOR.reflected_inertia)
+"""Gains of the calf joints, N m/rad and N m s/rad."""
 
-STIFFNESS_HIP = HIP_ACTUATOR.reflected_inertia * NATURAL_FREQ**2
-"""Stiffness of the hip and thigh joints, N m/rad."""
-DAMPING_HIP = 2 * DAMPING_RATIO * HIP_ACTUATOR.reflected_inertia * NATURAL_FREQ
-"""Damping of the hip and thigh joints, N m s/rad."""
-STIFFNESS_KNEE = KNEE_ACTUATOR.reflected_inertia * NATURAL_FREQ**2
-"""Stiffness of the calf joints, N m/rad."""
-DAMPING_KNEE = 2 * DAMPING_RATIO * KNEE_ACTUATOR.reflected_inertia * NATURAL_FREQ
-"""Damping of the calf joints, N m s/rad."""
-
-GO1_HIP_ACTUATOR_CFG = BuiltinPositionActuatorCfg(
-    target_names_expr=(".*_hip_joint", ".*_thigh_joint"),
-    stiffness=STIFFNESS_HIP,
-    damping=DAMPING_HIP,
-    effort_limit=HIP_ACTUATOR.effort_limit,
-    armature=HIP_ACTUATOR.reflected_inertia,
-)
+GO1_HIP_ACTUATOR_CFG = position_actuator(HIP_ACTUATOR, (".*_hip_joint", ".*_thigh_joint"))
 """Actuators of the hip and thigh joints."""
-GO1_KNEE_ACTUATOR_CFG = BuiltinPositionActuatorCfg(
-    target_names_expr=(".*_calf_joint",),
-    stiffness=STIFFNESS_KNEE,
-    damping=DAMPING_KNEE,
-    effort_limit=KNEE_ACTUATOR.effort_limit,
-    armature=KNEE_ACTUATOR.reflected_inertia,
-)
+GO1_KNEE_ACTUATOR_CFG = position_actuator(KNEE_ACTUATOR, (".*_calf_joint",))
 """Actuators of the calf joints."""
-GO1_ARTICULATION = EntityArticulationInfoCfg(
-    actuators=(GO1_HIP_ACTUATOR_CFG, GO1_KNEE_ACTUATOR_CFG),
-    soft_joint_pos_limit_factor=0.9,
-)
+_ACTUATORS = (GO1_HIP_ACTUATOR_CFG, GO1_KNEE_ACTUATOR_CFG)
+GO1_ARTICULATION = EntityArticulationInfoCfg(actuators=_ACTUATORS, soft_joint_pos_limit_factor=0.9)
 """All actuators."""
 
-# An action of one is a quarter of the angle at which the spring alone gives the effort limit.
-_ACTION_EFFORT_SHARE = 0.25
-GO1_ACTION_SCALE: dict[str, float] = {
-    ".*_hip_joint": _ACTION_EFFORT_SHARE * HIP_ACTUATOR.effort_limit / STIFFNESS_HIP,
-    ".*_thigh_joint": _ACTION_EFFORT_SHARE * HIP_ACTUATOR.effort_limit / STIFFNESS_HIP,
-    ".*_calf_joint": _ACTION_EFFORT_SHARE * KNEE_ACTUATOR.effort_limit / STIFFNESS_KNEE,
-}
+GO1_ACTION_SCALE = action_scale(_ACTUATORS)
 """Scale of joint position actions by joint pattern, rad per unit of action."""
 
 # The home keyframe.

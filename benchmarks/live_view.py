@@ -1,0 +1,150 @@
+"""What `train --live` costs: speed of training with a browser connected, without one, and apart.
+
+Training of Go1 on flat ground runs once. A client that takes what a browser takes, and draws
+nothing, connects and disconnects again and again meanwhile, so that both kinds of iterations are
+spread over the same minutes. `python benchmarks/live_view.py [MINUTES]` prints one line of JSON:
+steps per second of both kinds, the median over neighbouring blocks of their ratio, and the processor
+time that the view took, in cores.
+
+The machine has to be quiet otherwise: what is looked for is 2 %.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import multiprocessing
+import os
+import signal
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import viser
+from websockets.sync.client import connect
+
+from mjlab.rl.config import EvaluationCfg
+from mjlab.rl.progress import IterationStats, TrainingObserver
+from mjlab.scripts import train_run
+from mjlab.scripts.live import LiveView
+from mjlab.tasks.registry import load_runner_cls
+
+TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
+BLOCK_S = 20.0
+
+# A browser counts as connected once it has said where its camera is.
+_CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (1.0, 1.0, 1.0),
+    "fov": 1.0, "near": 0.1, "far": 100.0, "image_height": 800, "image_width": 1280,
+    "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0),
+}  # fmt: skip
+
+
+def watch(url: str, block: Any) -> None:
+    """Watch the page for `BLOCK_S`, look away for as long, and so on; `block` counts both."""
+    protocol: Any = f"viser-v{viser.__version__}"
+    while True:
+        time.sleep(BLOCK_S)
+        address = url.replace("http", "ws")
+        with connect(address, subprotocols=[protocol], max_size=None, compression=None) as page:
+            page.send(msgspec.msgpack.encode(_CAMERA))
+            block.value += 1
+            end = time.monotonic() + BLOCK_S
+            while time.monotonic() < end:
+                with contextlib.suppress(TimeoutError):
+                    page.recv(timeout=0.5)
+        block.value += 1
+
+
+class Recorder(TrainingObserver):
+    """Notes the speed of every iteration and the processor time of the view."""
+
+    def __init__(self, view: LiveView, minutes: float) -> None:
+        self._view = view
+        self._end = time.monotonic() + 60.0 * minutes
+        self.rows: list[tuple[int, float, float, float]] = []
+        # The page is watched in blocks of an odd number.
+        spawn = multiprocessing.get_context("spawn")
+        self._block = spawn.Value("i", 0)
+        # What a browser does is not done by the process that is measured.
+        url = view._exchange.url
+        self._client = spawn.Process(target=_watch_when_there, args=(url, self._block), daemon=True)
+        self._client.start()
+
+    def on_iteration(self, stats: IterationStats) -> None:
+        """Note one iteration; end training when the time is up."""
+        process = self._view._process
+        assert process is not None
+        now = time.monotonic()
+        self.rows.append((self._block.value, stats.steps_per_second, now, _cpu_time(process.pid)))
+        if now > self._end:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def _watch_when_there(url: Path, block: Any) -> None:
+    while not url.exists():
+        time.sleep(0.1)
+    watch(url.read_text(), block)
+
+
+def _cpu_time(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def measure(minutes: float) -> dict[str, float]:
+    """Train for so long; return the figures."""
+    recorders: list[Recorder] = []
+    base: Any = load_runner_cls(TASK)
+
+    class Runner(base):
+        def learn(self, *args: Any, **kwargs: Any) -> None:
+            recorders.append(Recorder(self.observers[0], minutes))
+            self.observers.append(recorders[0])
+            super().learn(*args, **kwargs)
+
+    train_run.load_runner_cls = lambda _: Runner  # ty: ignore[invalid-assignment]
+    with tempfile.TemporaryDirectory() as folder:
+        cfg = train_run.TrainConfig.from_task(TASK, "cpu")
+        cfg.live, cfg.live_port, cfg.device, cfg.log_root = True, 8790, "cpu", folder
+        cfg.agent.max_iterations = 1_000_000
+        cfg.agent.evaluation = EvaluationCfg()
+        train_run.launch_training(TASK, cfg)
+    return summary(recorders[0].rows)
+
+
+def summary(rows: list[tuple[int, float, float, float]]) -> dict[str, float]:
+    """Return the figures of (block, steps per second, time, processor time) of each iteration."""
+    blocks: dict[int, list[float]] = {}
+    cores: dict[bool, list[float]] = {False: [], True: []}
+    for before, row in zip(rows, rows[1:], strict=False):
+        # Iterations that the client came or went in belong to neither kind; nor does the first
+        # block that is watched, in which the view is built.
+        if row[0] == before[0] and row[0] > 1:
+            blocks.setdefault(row[0], []).append(row[1])
+            cores[row[0] % 2 == 1].append((row[3] - before[3]) / (row[2] - before[2]))
+    speed = {block: float(np.median(values)) for block, values in blocks.items()}
+    ratios = [
+        speed[block] / np.mean([speed[block - 1], speed[block + 1]])
+        for block in speed
+        if block % 2 == 1 and block - 1 in speed and block + 1 in speed
+    ]
+    return {
+        "watched_steps_per_s": float(np.median([v for b, v in speed.items() if b % 2 == 1])),
+        "unwatched_steps_per_s": float(np.median([v for b, v in speed.items() if b % 2 == 0])),
+        "ratio": float(np.median(ratios)),
+        "ratio_standard_error": float(np.std(ratios) / np.sqrt(len(ratios))),
+        "blocks": len(speed),
+        "view_cores_watched": float(np.mean(cores[True])),
+        "view_cores_unwatched": float(np.mean(cores[False])),
+    }
+
+
+if __name__ == "__main__":
+    # As `train` sets it.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    print(json.dumps(measure(float(sys.argv[1]) if len(sys.argv) > 1 else 10.0)))
