@@ -80,7 +80,7 @@ def measure_case(case: Case) -> Row:
             getattr(bare, name)[:] = getattr(env.sim.data, name).numpy()
 
     if case.with_rays:
-        for origins, directions, groups, _ in recorded_rays(env):
+        for origins, directions, groups, *_ in recorded_rays(env):
             bare.cast(origins.numpy(), directions.numpy(), tuple(groups or range(6)))
     env_time, bare_time = alternate(
         bare, lambda: env.step(actions), steps=5, repeats=21, before=same_states
