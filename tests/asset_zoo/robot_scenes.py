@@ -53,6 +53,19 @@ def turn_on_its_side(sim: Simulation) -> None:
     sim.data.qpos[0, 3:7] = torch.tensor([0.5**0.5, 0.5**0.5, 0, 0])
 
 
+def check_light(model: mujoco.MjModel) -> None:
+    """Check the one light of a robot: a spot above it that follows its centre of mass."""
+    assert model.light_mode.tolist() == [mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM]
+    light = model.light(0)
+    assert light.type[0] == mujoco.mjtLightType.mjLIGHT_SPOT
+    np.testing.assert_allclose(light.pos, [0, 0, 2])
+    np.testing.assert_allclose(light.dir, [0, 0, -1])
+    np.testing.assert_allclose(light.diffuse, 0.7)
+    np.testing.assert_allclose(light.specular, 0.3)
+    np.testing.assert_allclose(light.ambient, 0.0)
+    assert (light.cutoff[0], light.exponent[0]) == (45, 10)
+
+
 def check_drawing_changes_nothing(
     cfg: EntityCfg, options: MujocoCfg, pose: dict[int, float], at_least: int
 ) -> None:

@@ -7,13 +7,13 @@ import sys
 from pathlib import Path
 
 import mujoco
-import numpy as np
 import pytest
 import torch
 from robot_drawing import drawing_differences
 from robot_figures import differences, load_table
 from robot_scenes import (
     check_drawing_changes_nothing,
+    check_light,
     compiled,
     place,
     scene_of,
@@ -46,17 +46,8 @@ def test_every_body_is_drawn_about_as_large_as_in_the_table():
 
 def test_the_light_and_the_cameras_follow_the_centre_of_mass():
     model = go1.get_spec().compile()
-    follow = mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
-    assert model.cam_mode.tolist() == [follow] * 4
-    assert model.light_mode.tolist() == [follow]
-    light = model.light(0)
-    assert light.type[0] == mujoco.mjtLightType.mjLIGHT_SPOT
-    np.testing.assert_allclose(light.pos, [0, 0, 2])
-    np.testing.assert_allclose(light.dir, [0, 0, -1])
-    np.testing.assert_allclose(light.diffuse, 0.7)
-    np.testing.assert_allclose(light.specular, 0.3)
-    np.testing.assert_allclose(light.ambient, 0.0)
-    assert (light.cutoff[0], light.exponent[0]) == (45, 10)
+    assert model.cam_mode.tolist() == [mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM] * 4
+    check_light(model)
 
 
 # The config, with the numbers of the task tables.

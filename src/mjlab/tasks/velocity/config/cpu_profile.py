@@ -17,13 +17,16 @@ def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     rl_cfg.actor.hidden_dims = rl_cfg.critic.hidden_dims = (128, 64)
     rl_cfg.actor.distribution_cfg = {
         "class_name": "GaussianDistribution",
-        "init_std": 0.5,
+        "init_std": 1.0,
         "std_type": "scalar",
     }
-    rl_cfg.algorithm.entropy_coef = 0.005
+    rl_cfg.algorithm.entropy_coef = 0.01
+    rl_cfg.algorithm.desired_kl = 0.02
+    rl_cfg.algorithm.num_learning_epochs = 4
+    rl_cfg.num_steps_per_env = 12
     rl_cfg.max_iterations = 2000
     rl_cfg.save_interval = 100
     evaluation = rl_cfg.evaluation
     evaluation.num_episodes = 200
-    evaluation.min_interval = 50
+    evaluation.min_interval = 100
     evaluation.solved_below = {"lin_vel_error": 0.25, "ang_vel_error": 0.35, "failure_rate": 0.05}
