@@ -282,6 +282,28 @@ def test_what_is_near_does_not_change_hills_wherever_the_rays_are(hilly, x, y, z
     assert all(p.parts for p in sim._engine._rays._plans.values())
 
 
+def test_the_same_rays_may_reach_farther_than_the_last_time(hilly):
+    sim, everything = hilly
+    origins = torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(5)) * 2.0
+    slanted = torch.nn.functional.normalize(torch.tensor([0.9, 0.4, -0.5]), dim=0)
+    directions = slanted.expand(2, 40, 3).contiguous()
+    for reach in (0.2, 0.2, 3.0, 3.0):
+        rays = (origins, directions, None, None, torch.full((40,), reach))
+        for near, every in zip(sim.raycast(*rays), everything.raycast(*rays), strict=True):
+            torch.testing.assert_close(near, every, atol=1e-6, rtol=0)
+
+
+def test_rays_are_cast_under_inference_mode_as_a_rollout_does(hilly):
+    sim, everything = hilly
+    with torch.inference_mode():
+        directions = torch.tensor(DOWN).repeat(2, 40, 1)
+        for height in (1.0, 2.0):
+            origins = torch.rand(2, 40, 3) * height
+            rays = (origins, directions, None, None, torch.full((40,), 3.0))
+            for near, every in zip(sim.raycast(*rays), everything.raycast(*rays), strict=True):
+                torch.testing.assert_close(near, every, atol=1e-6, rtol=0)
+
+
 @pytest.fixture(scope="module")
 def hilly():
     """A simulation that looks at what is near, and one that looks at everything."""

@@ -375,8 +375,10 @@ def _as_float32(request: Any, name: str, struct: str) -> np.ndarray[Any, Any]:
 
 def _as_tensor(name: str, array: np.ndarray[Any, Any]) -> torch.Tensor:
     """View rotation matrices as (N, ..., 3, 3), and every other field as it is."""
-    tensor = torch.from_numpy(array)
-    return tensor.view(*array.shape[:-1], 3, 3) if name in ROTATION_MATRICES else tensor
+    # A field may be read for the first time under `inference_mode`, whose tensors count no writes.
+    with torch.inference_mode(False):
+        tensor = torch.from_numpy(array)
+        return tensor.view(*array.shape[:-1], 3, 3) if name in ROTATION_MATRICES else tensor
 
 
 def _state_slice(model: mujoco.MjModel, component: mujoco.mjtState) -> slice:

@@ -90,7 +90,7 @@ class NearbyRays:
         self._tiles = np.full(rows, -1)
         self._hits = Hits.empty(rows, width)
         self._mask = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)
-        self._given: tuple[torch.Tensor | None, int] = (None, 0)
+        self._given: tuple[torch.Tensor | None, int, torch.Tensor | None] = (None, 0, None)
         self._along, self._sideways = np.empty(0), None
 
     def _expand(self, slots: int, rows: int) -> None:
@@ -150,7 +150,7 @@ class NearbyRays:
         Most often the directions are the same from call to call, which torch's count of writes to
         a tensor tells.
         """
-        if self._given[0] is not directions or self._given[1] != directions._version:
+        if not self._are_as_given(directions, reach):
             along = directions.index_select(1, self._columns).view(*shape, 3)
             self._sideways = None
             if (along[..., :2] != 0.0).any():
@@ -158,8 +158,19 @@ class NearbyRays:
                 limit = limit[self._columns].view(-1, self._width, 1).repeat(self._num_envs, 1, 1)
                 self._sideways = (along[..., :2] * limit).nan_to_num()
             self._along = along.numpy()
-            self._given = (directions, directions._version)
+            # Tensors made under `inference_mode` do not count writes, so they are never the same.
+            version = -1 if directions.is_inference() else directions._version
+            self._given = (directions, version, None if reach is None else reach.clone())
         return self._along, self._sideways
+
+    def _are_as_given(self, directions: torch.Tensor, reach: torch.Tensor | None) -> bool:
+        """Return whether these are the directions and the reach of the last call."""
+        last, version, last_reach = self._given
+        if last is not directions or directions.is_inference() or version != directions._version:
+            return False
+        if reach is None or last_reach is None:
+            return reach is last_reach
+        return torch.equal(reach, last_reach)
 
     def _bounds(self, start: torch.Tensor, sideways: torch.Tensor | None) -> tuple[Array, Array]:
         """Return the centres and half extents (rows, 2) of what the rays cross on the ground."""
