@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import learning
+import locomotion
 import repeatability
 import startup
 import throughput
@@ -11,7 +12,7 @@ from report import RESULTS, Row, show, write
 
 def main() -> None:
     rows: list[Row] = []
-    for benchmark in (throughput, startup, repeatability, learning):
+    for benchmark in (throughput, locomotion, startup, repeatability, learning):
         print(f"{benchmark.__name__} ...", flush=True)
         rows += benchmark.measure()
         # Written after each, so that a long run that is stopped has left what it measured.

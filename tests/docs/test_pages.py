@@ -6,6 +6,8 @@ import importlib
 import re
 import subprocess
 import tomllib
+from dataclasses import fields, is_dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -16,6 +18,9 @@ PAGES = sorted((ROOT / "docs").glob("*.md")) + sorted((ROOT / "docs" / "api").gl
 _COMMAND = re.compile(r"\buv run (?:--\S+ )*([\w-]+)")
 _FLAG = re.compile(r"(?<![\w-])--([a-z][\w.-]*[a-z])")
 _OBJECT = re.compile(r"^\.\. auto\w+:: (\S+)$", re.MULTILINE)
+_COMMAND_LINE = re.compile(
+    r"\b(train-seeds|train|demo|play|evaluate|profile-env|visualize_terrain)((?: [^\s`#]+)*)"
+)
 _MAKE = re.compile(r"\bmake ([a-z-]+)")
 
 # Flags of `train` that stand for any field of the configs, and those of other programs.
@@ -44,36 +49,78 @@ def test_make_targets_exist(page: Path) -> None:
     assert set(_MAKE.findall(_code(page.read_text(encoding="utf-8")))) <= targets
 
 
-def test_flags_are_fields_of_the_commands() -> None:
-    from dataclasses import fields, is_dataclass
-
+@cache
+def _flags_of() -> dict[str, list[object]]:
+    """Each command's flags: configs, whose fields they are, and sets of names."""
     from mjlab.scripts.evaluate import EvaluateConfig
     from mjlab.scripts.play import PlayConfig
     from mjlab.scripts.profile_env import ProfileConfig
     from mjlab.scripts.train import TrainConfig
     from mjlab.scripts.visualize_terrain import VisualizeTerrainConfig
 
-    def exists(config: object, path: list[str]) -> bool:
-        if not path:
-            return True
-        name = path[0].replace("-", "_")
-        if isinstance(config, dict):
-            return name in config and exists(config[name], path[1:])
-        if not is_dataclass(config) or name not in {field.name for field in fields(config)}:
-            return False
-        return exists(getattr(config, name), path[1:])
-
     train = TrainConfig.from_task("Mjlab-Cartpole-Swingup")
-    configs = (train, PlayConfig(), EvaluateConfig(), ProfileConfig(), VisualizeTerrainConfig())
+    play = PlayConfig(env=train.env)
+    return {
+        "train": [train],
+        "train-seeds": [train, {"seeds": None}],
+        "demo": [play],
+        "play": [play],
+        "evaluate": [EvaluateConfig(env=train.env)],
+        "profile-env": [ProfileConfig(env=train.env)],
+        "visualize_terrain": [VisualizeTerrainConfig()],
+    }
+
+
+def _has(config: object, path: list[str]) -> bool:
+    if not path:
+        return True
+    name = path[0].replace("-", "_")
+    if isinstance(config, dict):
+        return name in config and _has(config[name], path[1:])
+    if not is_dataclass(config) or name not in {field.name for field in fields(config)}:
+        return False
+    return _has(getattr(config, name), path[1:])
+
+
+def _unknown(command: str, text: str) -> set[str]:
+    """Return the flags in `text` that `command` does not have."""
+    configs = _flags_of()[command]
+    return {
+        flag
+        for flag in _FLAG.findall(text)
+        if flag != "help" and not any(_has(config, flag.split(".")) for config in configs)
+    }
+
+
+def test_flags_are_fields_of_the_commands() -> None:
     unknown = set()
     for page in PAGES:
-        for flag in _FLAG.findall(_code(page.read_text(encoding="utf-8"))):
-            known = flag in _ELSEWHERE | _TORCHRUN or any(
-                exists(cfg, flag.split(".")) for cfg in configs
-            )
-            if not known:
-                unknown.add(f"{page.name}: --{flag}")
+        code = _code(page.read_text(encoding="utf-8"))
+        flags = set.intersection(*(_unknown(command, code) for command in _flags_of()))
+        unknown |= {f"{page.name}: --{flag}" for flag in flags - _ELSEWHERE - _TORCHRUN}
     assert not unknown
+
+
+def test_flags_on_a_command_line_are_of_that_command() -> None:
+    """Command lines, and the tables of flags in the sections of `docs/command_line.md`."""
+    wrong = set()
+    for page in [*PAGES, ROOT / "README.md", ROOT / "src/mjlab/demo/README.md"]:
+        code = _code(page.read_text(encoding="utf-8")).replace("\\\n", " ")
+        for command, rest in _COMMAND_LINE.findall(code):
+            wrong |= {f"{page.name}: {command} --{flag}" for flag in _unknown(command, rest)}
+    text = (ROOT / "docs" / "command_line.md").read_text(encoding="utf-8")
+    for command, section in re.findall(r"^## ([\w-]+)\n(.*?)(?=^## |\Z)", text, re.M | re.S):
+        if command not in _flags_of():
+            continue
+        for row in re.findall(r"^\| (`--.*?) \|", section, re.MULTILINE):
+            wrong |= {f"table of {command}: --{flag}" for flag in _unknown(command, row)}
+    assert not wrong
+
+
+def test_a_flag_that_only_another_command_has_is_noticed() -> None:
+    assert _unknown("train", "TASK --live --host 0.0.0.0") == {"host"}
+    assert not _unknown("play", "TASK --host 0.0.0.0")
+    assert _unknown("profile-env", "TASK --num-episodes 3") == {"num-episodes"}
 
 
 def test_documented_objects_exist() -> None:

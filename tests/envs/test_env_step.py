@@ -135,6 +135,28 @@ def test_rewards_read_derived_quantities_one_substep_old_and_observations_curren
         torch.testing.assert_close(current[:, 0], current[:, 1], atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("looks_between", [False, True])
+def test_rewards_of_the_very_first_step_read_quantities_as_old_as_those_of_any_other(
+    make, looks_between
+):
+    # A field that nothing else reads, so that the reward of the first step is the first to do so.
+    def center_of_mass(env):
+        return env.sim.data.subtree_com[:, -1, 0].clone()
+
+    def edit(cfg):
+        cfg.rewards = {"body": RewardTermCfg(func=center_of_mass, weight=1.0)}
+        if looks_between:
+            cfg.metrics["between"] = MetricsTermCfg(func=joint_pos, per_substep=True)
+
+    env = make(edit)
+    rewards = []
+    for _ in range(2):
+        env.reset(seed=3)
+        rewards.append(env.step(actions(1)[0])[1].clone())
+    assert rewards[0].abs().min() > 0.0
+    assert torch.equal(rewards[0], rewards[1])
+
+
 def test_one_dispatch_for_all_substeps_gives_the_bits_of_one_for_each(make):
     together = make()
     assert together._steps_as_one

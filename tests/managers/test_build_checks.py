@@ -52,3 +52,59 @@ def test_a_term_that_is_off_by_its_weight_is_checked_too(make_env, seen):
     off.weight = 0.0
     RewardManager({"a": off}, make_env())
     assert len(seen) == 1
+
+
+class Checked:
+    """A term that checks a parameter when it is built, and draws."""
+
+    def __init__(self, cfg, env):
+        self.size = cfg.params["size"]
+        if self.size < 0:
+            raise TypeError("size is negative")
+
+    def __call__(self, env, size, asset_cfg, other):
+        return torch.full((env.num_envs,), float(self.size))
+
+    def debug_vis(self, visualizer):
+        raise NotImplementedError
+
+
+def unfilled(kind, seen):
+    if kind == "function":
+        return cfg(term(seen, ValueError("size is negative")), size=-1), ValueError
+    return cfg(Checked, size=-1), TypeError
+
+
+@pytest.mark.parametrize("kind", ["function", "class"])
+def test_an_unfilled_reward_of_weight_0_is_an_error_once_it_has_a_weight(
+    make_env, seen, caplog, kind
+):
+    off, error = unfilled(kind, seen)
+    off.weight = 0.0
+    manager = RewardManager({"a": off}, make_env())
+    assert "RewardManager term 'a': size is negative It has weight 0" in caplog.text
+    assert (manager.compute(dt=1.0) == 0.0).all()
+    manager.reset(None)
+    assert manager.get_visualizable_terms() == []
+    manager.get_term_cfg("a").weight = 2.0
+    for _ in range(2):
+        with pytest.raises(error, match="RewardManager term 'a': size is negative"):
+            manager.compute(dt=1.0)
+
+
+def test_a_reward_of_weight_0_that_is_filled_later_is_built_then(make_env, seen):
+    off, _ = unfilled("class", seen)
+    off.weight = 0.0
+    manager = RewardManager({"a": off}, make_env())
+    live = manager.get_term_cfg("a")
+    live.weight, live.params["size"] = 2.0, 3
+    for _ in range(2):
+        assert (manager.compute(dt=1.0) == 6.0).all()
+    assert isinstance(live.func, Checked)
+
+
+@pytest.mark.parametrize("kind", ["function", "class"])
+def test_an_unfilled_reward_with_a_weight_is_refused(make_env, seen, kind):
+    on, error = unfilled(kind, seen)
+    with pytest.raises(error, match="RewardManager term 'a': size is negative"):
+        RewardManager({"a": on}, make_env())

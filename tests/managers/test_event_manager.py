@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mjlab.managers import EventManager, EventTermCfg
+from mjlab.managers import EventManager, EventTermCfg, SceneEntityCfg
 from mjlab.managers.event_manager import RecomputeLevel, requires_model_fields
 
 
@@ -268,3 +268,23 @@ def test_terms_of_all_modes_are_reset_and_may_draw(env):
         assert manager.get_term_cfg(name).func.ids == ["reset"]
         assert manager.get_term_cfg(name).func.drawn == 1
     assert manager.get_term_cfg("c").func.ids == []
+
+
+@pytest.mark.parametrize("empty", [{"geom_names": ()}, {"geom_ids": []}])
+def test_an_event_for_nothing_is_told_by_name(env, caplog, empty):
+    params = {"asset_cfg": SceneEntityCfg("robot", **empty)}
+    event = EventTermCfg(func=lambda env, env_ids, asset_cfg: None, mode="startup", params=params)
+    EventManager({"friction": event}, env)
+    assert "term 'friction', parameter 'asset_cfg': geom_names of entity 'robot'" in caplog.text
+
+
+def test_an_event_for_something_is_not_told(env, caplog):
+    selections = (SceneEntityCfg("robot"), SceneEntityCfg("robot", geom_names=("geom_a",)))
+    for asset_cfg in selections:
+        event = EventTermCfg(
+            func=lambda env, env_ids, asset_cfg: None,
+            mode="startup",
+            params={"asset_cfg": asset_cfg},
+        )
+        EventManager({"friction": event}, env)
+    assert not caplog.records

@@ -78,6 +78,30 @@ def test_a_derived_field_is_current_when_first_read():
     assert torch.allclose(sim.data.site_xpos[:, tip, 2], torch.tensor(2.3))
 
 
+@pytest.mark.parametrize("substeps", [(4,), (1,), (1, 1, 1)])
+def test_a_field_first_read_in_the_first_step_is_as_old_as_one_that_was_read_before(substeps):
+    early, late = make_sim(), make_sim()
+    bound = {name: getattr(early.data, name) for name in ("xpos", "cvel", "qfrc_actuator")}
+    for sim in (early, late):
+        sim.data.ctrl[:] = torch.arange(4.0).view(4, 1)
+        sim.data.qvel[:, 1:] = 0.3
+        sim.forward()
+        for nstep in substeps:
+            sim.data.ctrl[:] += 0.1
+            sim.step(nstep)
+        # Writes are pending while the fields are read: to inputs known before and to new ones.
+        sim.reset(torch.tensor([2]))
+        sim.data.xfrc_applied[1, 1, 0] = 5.0
+    for name, values in bound.items():
+        assert torch.equal(getattr(late.data, name), values), name
+    for sim in (early, late):
+        sim.forward()
+        sim.step(7)
+        assert sim.data.qvel[1, 0] != 0.0
+    for name in ("qpos", "qvel", "xpos", "cvel", "time"):
+        assert torch.equal(getattr(late.data, name), getattr(early.data, name)), name
+
+
 def test_reading_a_field_late_changes_nothing_else():
     plain, late = make_sim(), make_sim()
     for sim in (plain, late):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
@@ -20,9 +21,12 @@ from mjlab.managers.model_fields import (
     join_levels,
 )
 from mjlab.managers.model_fields import requires_model_fields as requires_model_fields
+from mjlab.managers.scene_entity_config import SceneEntityCfg
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
+
+logger = logging.getLogger(__name__)
 
 EventMode = Literal["startup", "reset", "interval", "step"]
 
@@ -178,6 +182,23 @@ class EventManager(TermFunctionSwitches, TermListManager):
                     f"{get_args(EventMode)}."
                 )
         super()._prepare_terms()
+
+    def _resolve_params(self, name: str, cfg: ManagerTermBaseCfg) -> None:
+        """Resolve selections, and tell of those that are explicitly empty.
+
+        An empty selection is allowed and changes nothing. Where it was forgotten rather than
+        meant, nobody would notice otherwise.
+        """
+        super()._resolve_params(name, cfg)
+        for key, value in cfg.params.items():
+            if not isinstance(value, SceneEntityCfg):
+                continue
+            for attribute in value.empty_selections():
+                logger.warning(
+                    "%s, parameter %r: %s of entity %r is empty, so the event changes nothing "
+                    "there. Name what it is for, or set the term to None.",
+                    *(self._label(name), key, attribute, value.name),
+                )
 
     def _prepare_time(self, name: str, cfg: EventTermCfg) -> None:
         if cfg.mode == "reset":

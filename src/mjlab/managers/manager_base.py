@@ -185,6 +185,10 @@ class ManagerBase(ABC):
             raise TypeError(
                 f"{self._label(name)}: func must be a function or a class, got {cfg.func!r}."
             )
+        self._make_callable(name, cfg, leading)
+
+    def _make_callable(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
+        """Replace a class by an instance of it, and check that the term can be called."""
         if inspect.isclass(cfg.func):
             with errors_named(self._label(name)):
                 cfg.func = cfg.func(cfg=cfg, env=self._env)

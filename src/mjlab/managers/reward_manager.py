@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,9 +14,12 @@ import torch
 from mjlab.managers.debug_vis import TermFunctionSwitches
 from mjlab.managers.env_ids import as_index, is_empty
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
+from mjlab.managers.unready_term import UnreadyTerm
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(kw_only=True)
@@ -23,7 +27,8 @@ class RewardTermCfg(ManagerTermBaseCfg):
     """A reward term: `func(env, **params)` returns one number for each environment."""
 
     weight: float
-    """Factor of the term in the sum. With 0 the function is not called at all."""
+    """Factor of the term in the sum. With 0 the function is not called at all, and what does not
+    fit is told as a warning; it is an error at the first step with another weight."""
 
 
 class RewardManager(TermFunctionSwitches, TermListManager):
@@ -110,6 +115,33 @@ class RewardManager(TermFunctionSwitches, TermListManager):
                     "To switch the term off, set the weight to 0 or the whole term to None."
                 )
         super()._prepare_terms()
+
+    def _make_callable(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
+        """Build a term; one of weight 0 may be unfilled until a curriculum gives it a weight."""
+        assert isinstance(cfg, RewardTermCfg)
+        given, build_now = cfg.func, super()._make_callable
+        try:
+            build_now(name, cfg, leading)
+        except (KeyError, TypeError, ValueError) as error:
+            if cfg.weight != 0.0:
+                raise
+            logger.warning(
+                "%s It has weight 0, so it is not needed; with another weight this is an error.",
+                error.args[0] if len(error.args) == 1 else error,
+            )
+        else:
+            return
+
+        def build_later() -> Any:
+            cfg.func = given
+            try:
+                build_now(name, cfg, leading)
+            except Exception:
+                cfg.func = unready
+                raise
+            return cfg.func
+
+        cfg.func = unready = UnreadyTerm(build_later)
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
         """Return, for one environment, the weighted rate of each term in the last step."""

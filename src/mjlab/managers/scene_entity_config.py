@@ -107,6 +107,12 @@ class SceneEntityCfg:
             setattr(self, f"{kind}_names", names)
             setattr(self, f"{kind}_ids", ids)
 
+    def empty_selections(self) -> list[str]:
+        """Return the fields of names, such as `geom_names`, that explicitly select nothing."""
+        fields = [f"{kind}_names" for kind in _FINDERS]
+        # An empty string is a pattern, which has to match something.
+        return [field for field in fields if getattr(self, field) in ((), [])]
+
     def _resolve_kind(
         self, kind: str, names: Any, ids: Any, entity: Any
     ) -> tuple[list[str], list[int] | slice]:

@@ -7,6 +7,7 @@ import dataclasses
 import operator
 import time
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from functools import reduce
 from typing import TYPE_CHECKING, Any
 
@@ -43,8 +44,9 @@ def evaluate_policy(
 
     Each environment is scored once in a round, on its first episode after a reset, so that short
     episodes do not count more often than long ones. Where more episodes are asked for than there
-    are environments, there are several rounds. On the CPU, torch gets as many threads as the policy
-    is worth.
+    are environments, there are several rounds. No curriculum moves environments to other terrain
+    meanwhile, so that no round or evaluation is harder than the one before. On the CPU, torch gets
+    as many threads as the policy is worth.
 
     Args:
         env: The environments; their state is not kept.
@@ -68,7 +70,11 @@ def evaluate_policy(
         env.seed(seed)
     start = time.perf_counter()
     rounds = []
-    with threads_for_policy(policy, env.num_envs, env.device), torch.inference_mode():
+    with (
+        threads_for_policy(policy, env.num_envs, env.device),
+        _terrain_held(env),
+        torch.inference_mode(),
+    ):
         for first in range(0, num_episodes, env.num_envs):
             count = min(env.num_envs, num_episodes - first)
             record = _Recorder(env, count, success_func, metrics or {})
@@ -78,6 +84,12 @@ def evaluate_policy(
     if successes is None and success_return is not None:
         successes = episodes.returns >= success_return
     return summarize(episodes, successes, time.perf_counter() - start)
+
+
+def _terrain_held(env: RslRlVecEnvWrapper) -> AbstractContextManager[None]:
+    """Return a context in which no curriculum moves the environments to other terrain."""
+    terrain = getattr(getattr(env.unwrapped, "scene", None), "terrain", None)
+    return nullcontext() if terrain is None else terrain.levels_held()
 
 
 def _resolve_max_steps(env: RslRlVecEnvWrapper, num_episodes: int, max_steps: int | None) -> int:

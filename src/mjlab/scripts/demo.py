@@ -57,9 +57,8 @@ def run_demo(cfg: PlayConfig) -> None:
 
     if cfg.agent == "trained" and cfg.checkpoint_file == str(POLICY) and not POLICY.is_file():
         raise UserError(
-            f"The demo's policy is missing: there is no {POLICY}. It is part of the repository and "
-            "of the package, so install one of them anew; or name another policy of "
-            f"{TASK} with --checkpoint-file FILE.onnx."
+            f"The demo has no policy of its own yet: there is no {POLICY}. Name a policy of {TASK} "
+            "with --checkpoint-file FILE.onnx; `train` leaves one in the folder of every run."
         )
     run_play(TASK, cfg)
 

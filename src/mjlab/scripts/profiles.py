@@ -81,6 +81,6 @@ def suggest_profile(task: str, profile: str | None, device: str) -> None:
     """Say in one line that there is a profile for training on a CPU, if it is of use here."""
     if profile is None and device == "cpu" and CPU_PROFILE in list_profiles(task):
         tell(
-            f"Training on the CPU: `train {task} {_FLAG} {CPU_PROFILE}` has the settings that "
-            "learn fastest there."
+            f"Training on the CPU: `train {task} {_FLAG} {CPU_PROFILE}` has settings for a "
+            "few cores."
         )

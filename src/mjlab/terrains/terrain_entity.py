@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal, NoReturn
 
@@ -81,7 +83,7 @@ class TerrainEntity(Entity):
     """The ground: one static body `terrain` of the world, and the environments' origins."""
 
     # The ground is built from the config; a checkpoint says where on it the environments are.
-    _transient = {"_device", "_flat_patches", "_flat_patch_radii"}
+    _transient = {"_device", "_flat_patches", "_flat_patch_radii", "_holds_levels"}
 
     cfg: TerrainEntityCfg
 
@@ -104,6 +106,7 @@ class TerrainEntity(Entity):
         """Number of levels; 0 on a plane."""
         self.terrain_generator: TerrainGenerator | None = None
         """What made the terrain; None on a plane."""
+        self._holds_levels = False
         self._flat_patches: dict[str, torch.Tensor] = {}
         self._flat_patch_radii: dict[str, float] = {}
         super().__init__(_without_plane(cfg) if cfg.terrain_type == "generator" else cfg)
@@ -220,7 +223,7 @@ class TerrainEntity(Entity):
     def update_env_origins(
         self, env_ids: torch.Tensor, move_up: torch.Tensor, move_down: torch.Tensor
     ) -> None:
-        """Move environments up or down a level; nothing on a plane.
+        """Move environments up or down a level; nothing on a plane or while levels are held.
 
         Those that pass the highest level go to a random one, and none go below the lowest. The
         column of an environment never changes here.
@@ -230,13 +233,25 @@ class TerrainEntity(Entity):
             move_up: (k,) whether each goes up.
             move_down: (k,) whether each goes down.
         """
-        if self.terrain_origins is None or self.terrain_levels is None:
+        if self._holds_levels or self.terrain_origins is None or self.terrain_levels is None:
             return
         levels = self.terrain_levels[env_ids] + move_up.long() - move_down.long()
         # One draw for every environment, so that how many are drawn does not depend on results.
         drawn = torch.randint_like(levels, self.max_terrain_level)
         levels = torch.where(levels >= self.max_terrain_level, drawn, levels.clamp(min=0))
         self._go_to_levels(env_ids, levels)
+
+    @contextmanager
+    def levels_held(self) -> Generator[None]:
+        """Within this context `update_env_origins` does nothing: no curriculum moves environments.
+
+        That is for evaluations, whose figures must not depend on those before them.
+        """
+        held, self._holds_levels = self._holds_levels, True
+        try:
+            yield
+        finally:
+            self._holds_levels = held
 
     def randomize_env_origins(self, env_ids: torch.Tensor) -> None:
         """Move environments to cells drawn uniformly; nothing on a plane."""

@@ -103,16 +103,21 @@ def test_the_actor_observes_biased_joints_and_the_critic_true_ones(make_env):
 
 
 def terms_on(engine: str, task: str, steps: int) -> dict[str, torch.Tensor]:
-    """Return each reward term after some steps, with the same random numbers on every engine."""
+    """Return each reward term at every step, with the same random numbers on every engine."""
     cfg = task_cfg(task, num_envs=3)
     cfg.sim.engine = engine
     env = ManagerBasedRlEnv(cfg, device="cpu")
+    generator = torch.Generator().manual_seed(0)
     try:
         env.reset()
-        walk(env, steps)
-        rates = env.reward_manager._step_reward
+        rates = []
+        for _ in range(steps):
+            env.step(
+                torch.rand((3, env.action_manager.total_action_dim), generator=generator) - 0.5
+            )
+            rates.append(env.reward_manager._step_reward.clone())
         names = env.reward_manager.active_terms
-        return {name: rates[:, k].clone() for k, name in enumerate(names)}
+        return {name: torch.stack(rates)[..., k] for k, name in enumerate(names)}
     finally:
         env.close()
 

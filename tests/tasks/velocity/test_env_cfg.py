@@ -85,14 +85,67 @@ def test_the_base_config_is_that_of_the_g1_but_for_what_a_robot_brings():
     assert not base.scene.terrain.terrain_generator.curriculum  # ty: ignore
 
 
-def test_the_base_config_without_a_robot_is_refused(make_env):
-    def edit(cfg):
-        base = make_velocity_env_cfg()
-        cfg.rewards = {"foot_slip": base.rewards["foot_slip"]}
+def take_from_base(kind: str, name: str):
+    """Return an edit that puts one term of the base config, unfilled, in place of all others."""
 
-    with pytest.raises(
-        ValueError, match="'foot_slip': asset_cfg selects no site of entity 'robot'"
-    ):
+    def edit(cfg):
+        setattr(cfg, kind, {name: getattr(make_velocity_env_cfg(), kind)[name]})
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("foot_slip", "asset_cfg selects no site of entity 'robot'"),
+        ("foot_clearance", "asset_cfg selects no site of entity 'robot'"),
+        ("upright", r"asset_cfg selects the bodies \[\] of entity 'robot'"),
+        ("pose", "std_standing has no entry for the joints"),
+    ],
+)
+def test_rewards_of_the_base_config_that_are_not_filled_in_are_refused(make_env, name, message):
+    with pytest.raises(ValueError, match=f"'{name}': {message}"):
+        make_env(edit=take_from_base("rewards", name))
+
+
+@pytest.mark.parametrize(
+    ("name", "params", "message"),
+    [
+        ("body_ang_vel", {}, "asset_cfg selects the bodies [] of entity 'robot'"),
+        # As of a robot without the sensor that the base config names.
+        ("angular_momentum", {"sensor_name": "robot/angmom_x"}, "The scene has no sensor"),
+    ],
+)
+def test_rewards_of_weight_0_may_be_left_unfilled(make_env, caplog, name, params, message):
+    def edit(cfg):
+        take_from_base("rewards", name)(cfg)
+        cfg.rewards[name].params.update(params)
+
+    env = make_env(edit=edit)
+    assert f"'{name}': {message}" in caplog.text
+    env.reset()
+    env.step(torch.zeros(4, 12))
+    env.reward_manager.get_term_cfg(name).weight = -1.0
+    with pytest.raises(ValueError, match=f"'{name}': "):
+        env.step(torch.zeros(4, 12))
+
+
+@pytest.mark.parametrize(
+    ("name", "field"), [("foot_friction", "geom_names"), ("base_com", "body_names")]
+)
+def test_events_of_the_base_config_that_are_not_filled_in_are_told(make_env, caplog, name, field):
+    make_env(edit=take_from_base("events", name))
+    assert f"'{name}', parameter 'asset_cfg': {field} of entity 'robot' is empty" in caplog.text
+
+
+@pytest.mark.parametrize("sensor", [0, 1])
+def test_sensors_of_the_base_config_that_are_not_filled_in_are_refused(make_env, sensor):
+    def edit(cfg):
+        base = make_velocity_env_cfg().scene.sensors[sensor]
+        kept = tuple(s for s in cfg.scene.sensors if s.name != base.name)
+        cfg.scene.sensors = (*kept, base)
+
+    with pytest.raises(ValueError, match=("terrain_scan", "foot_height_scan")[sensor]):
         make_env(edit=edit)
 
 

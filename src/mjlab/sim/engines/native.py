@@ -24,6 +24,7 @@ from mjlab.sim.engines.field_lists import (
     INPUTS,
     ZERO_INPUTS,
 )
+from mjlab.sim.engines.native_first_step import FirstStep
 from mjlab.sim.engines.native_midphase import FIELDS as MIDPHASE_FIELDS
 from mjlab.sim.engines.native_midphase import MidphaseMargins
 from mjlab.sim.engines.native_rays import NativeRays
@@ -88,6 +89,7 @@ class NativeEngine(Engine):
             ) from error
         self._arrays: dict[str, np.ndarray] = {}
         self._derived: set[str] = set()
+        self._first_step = FirstStep(self._batch, self._arrays)
         self._tensors: dict[str, torch.Tensor] = {}
         self._model_arrays: dict[str, np.ndarray] = {}
         self._model_tensors: dict[str, torch.Tensor] = {}
@@ -121,19 +123,26 @@ class NativeEngine(Engine):
         if name not in self._tensors:
             refuse_without_sensor(self._model, name)
             tensor = self._bind(name)
-            if name not in INPUTS and tensor.numel():
+            if name in INPUTS:
+                self._first_step.input_was_bound(name)
+            elif tensor.numel():
                 self._fill(name)
         return self._tensors[name]
 
     def _fill(self, new: str) -> None:
         """Compute a field that was just bound, which reads zero until the next call.
 
-        Only this field is made current. The others stay as they were, and so does the solver's
-        warm start: whether a field is first read in the middle of a step changes nothing else.
+        Only this field is computed: in the middle of the first step from the state one substep
+        ago, as in every later step, and else from the current state. The others stay as they
+        were, and so does the solver's warm start: when a field is first read changes nothing else.
         """
         others = [name for name in self._derived if name != new]
         saved = {name: self._arrays[name].copy() for name in others}
-        self._forward_keeping_warm_start()
+        if self._first_step.can_repeat:
+            self._refresh_midphase()
+            self._first_step.repeat_substep()
+        else:
+            self._forward_keeping_warm_start()
         for name, values in saved.items():
             self._arrays[name][:] = values
 
@@ -201,9 +210,13 @@ class NativeEngine(Engine):
 
     def step(self, nstep: int) -> None:
         self._refresh_midphase()
-        self._batch.step(nstep=nstep)
+        if self._first_step.is_over or nstep < 1:
+            self._batch.step(nstep=nstep)
+        else:
+            self._first_step.step(nstep, self._forward_keeping_warm_start)
 
     def forward(self, env_ids: torch.Tensor | None) -> None:
+        self._first_step.forward()
         # Where nobody reads a derived field there is nothing to make current. One that is read
         # later is computed then.
         if self._derived:
@@ -251,6 +264,7 @@ class NativeEngine(Engine):
     def recompute_constants(self, level: int, env_ids: torch.Tensor | None) -> None:
         # mj_setConst does both parts at once; the part not asked for comes out as it was.
         self.expand(self.constants_written_by(level))
+        self._first_step.forget()
         self._batch.set_const(_as_ids(env_ids))
         # It also marks anew which frames coincide now, and these may be moved apart after it.
         for mark in self._frame_marks:
@@ -321,6 +335,7 @@ class NativeEngine(Engine):
     def state_dict(self) -> dict[str, Any]:
         # A call consumes the writes that are still pending, so that the rows hold everything; and
         # saving must not change how the run goes on.
+        self._first_step.forget()
         self._forward_keeping_warm_start()
         return {
             "state": torch.from_numpy(self._batch.bind("state").copy()),
@@ -336,6 +351,7 @@ class NativeEngine(Engine):
                 f"The saved simulation has {saved.shape[0]} environments with {saved.shape[1]} "
                 f"state values each; this one has {rows.shape[0]} with {rows.shape[1]}."
             )
+        self._first_step.forget()
         # A call consumes the writes that are still pending here, so that none lands on the rows.
         self._batch.forward()
         # Fields that were bound are bound again, because a field that is bound in the middle of

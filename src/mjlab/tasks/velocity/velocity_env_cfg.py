@@ -52,7 +52,9 @@ def make_velocity_env_cfg() -> ManagerBasedRlEnvCfg:
       `body_ang_vel`, `foot_clearance` and `foot_slip`; and the standard deviations of `pose`;
     - `viewer.body_name`.
 
-    Names left empty are refused when the environment is built.
+    Names of sensors and rewards left empty are refused when the environment is built. There is only
+    a warning for events, which then change nothing, and for rewards of weight 0 (here
+    `body_ang_vel` and `angular_momentum`), which are refused once they get a weight.
     """
     return ManagerBasedRlEnvCfg(
         decimation=4,

@@ -233,3 +233,49 @@ def test_xml_position_actuators_have_gains_and_xml_motors_have_none(make_world: 
     world = make_world(motor, actuators=(XmlActuatorCfg(target_names_expr=("slider",)),))
     with pytest.raises(TypeError, match="XmlActuator with command field 'effort'"):
         world.apply(dr.pd_gains, kp_range=(2.0, 2.0), kd_range=(2.0, 2.0))
+
+
+XML_SLIDER = (XmlActuatorCfg(target_names_expr=("slider",)),)
+XML_MOTORS = {
+    "ctrlrange": ('<motor joint="slider" gear="2" ctrlrange="-5 5"/>', 2.0),
+    "forcerange": ('<motor joint="slider" forcerange="-5 5"/>', 1.0),
+    "both": ('<motor joint="slider" ctrlrange="-5 5" forcerange="-5 5"/>', 1.0),
+    "gain": ('<general joint="slider" gainprm="10" ctrlrange="-.5 .5"/>', 1.0),
+}
+
+
+def slider_force(world: Any) -> list[float]:
+    """Return the force on the slider in the first two environments, for a large control."""
+    world.robot.data.joint_effort_target[:] = 90.0
+    world.robot.write_data_to_sim()
+    _ = world.sim.data.qfrc_actuator
+    world.sim.data.act[:] = 1.0
+    world.sim.forward()
+    return world.sim.data.qfrc_actuator[:2, 0].tolist()
+
+
+@pytest.mark.parametrize("kind", XML_MOTORS)
+def test_effort_limits_of_xml_motors_act_on_the_joint(make_world: Any, kind: str) -> None:
+    element, gear = XML_MOTORS[kind]
+    world, chosen = make_world(with_actuator(element), actuators=XML_SLIDER), torch.tensor([1])
+    world.apply(dr.effort_limits, chosen, effort_limit_range=(0.5, 0.5))
+    assert slider_force(world) == pytest.approx([5.0 * gear, 2.5 * gear])
+    world.apply(dr.effort_limits, chosen, effort_limit_range=(3.0, 3.0), operation="abs")
+    assert slider_force(world) == pytest.approx([5.0 * gear, 3.0 * gear])
+
+
+def test_effort_limits_of_xml_muscles_scale_their_force(make_world: Any) -> None:
+    muscle = with_actuator('<muscle joint="slider" force="30" lengthrange="-1 1"/>')
+    world = make_world(muscle, actuators=XML_SLIDER)
+    before = slider_force(world)
+    assert before[0] != 0.0
+    world.apply(dr.effort_limits, torch.tensor([1]), effort_limit_range=(0.5, 0.5))
+    assert slider_force(world) == pytest.approx([before[0], 0.5 * before[0]], rel=1e-4)
+
+
+def test_xml_motors_without_any_limit_are_refused_by_name(make_world: Any) -> None:
+    world = make_world(with_actuator('<motor joint="slider"/>'), actuators=XML_SLIDER)
+    with pytest.raises(
+        TypeError, match=r"effort_limits: .*\['slider'\].*forcerange or a ctrlrange"
+    ):
+        world.apply(dr.effort_limits, effort_limit_range=(0.5, 0.5))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
+import mujoco
 import torch
 
 from mjlab.actuator import (
@@ -151,7 +152,8 @@ def effort_limits(
     """Randomize the largest effort of actuators, drawn per environment and actuator.
 
     MuJoCo's own servos obey only if they were configured with an effort limit at all. The limit of
-    a motor holds before its gear; that of a muscle is its peak force.
+    a motor holds before its gear; that of a muscle is its peak force. Motors of the XML need a
+    `forcerange` or a `ctrlrange`; both are written.
 
     Args:
         env_ids: Environments to change; None means all.
@@ -162,18 +164,24 @@ def effort_limits(
 
     Raises:
         ValueError: another operation.
-        TypeError: a selected actuator is of a user's own kind.
+        TypeError: a selected actuator is of a user's own kind, or takes efforts and comes from an
+            XML that does not limit them.
     """
     dist, op = resolve_distribution(distribution), _scale_or_abs(operation, "effort_limits")
     bounds = read_bounds(effort_limit_range, "effort_limit_range")
     chosen = list(selected_actuators(env, resolve_env_ids(env, env_ids), asset_cfg))
-    places = [_limit_places(selected) for selected in chosen]
+    places = [_limit_places(env, selected) for selected in chosen]
     for selected, (columns, targets) in zip(chosen, places, strict=True):
         samples = selected.draw(dist, bounds, env.device)
         if isinstance(selected.actuator, IdealPdActuator):
             _set_ideal_limits(selected, op, samples)
         for place in targets:
-            _write(env, selected.rows, columns, place, op, samples)
+            values = samples
+            if op is ABS and place.field == "actuator_ctrlrange":
+                # Efforts are controls times the gain, which only motors of the XML have.
+                gains = env.sim.get_default_field("actuator_gainprm")[columns, 0]
+                values = samples / gains.abs()
+            _write(env, selected.rows, columns, place, op, values)
 
 
 def _gain_places(actuator: Actuator) -> Gains | None:
@@ -200,7 +208,9 @@ def _gain_places(actuator: Actuator) -> Gains | None:
     raise TypeError(_refusal("pd_gains", actuator, supported))
 
 
-def _limit_places(selected: SelectedActuator) -> tuple[torch.Tensor, tuple[Place, ...]]:
+def _limit_places(
+    env: ManagerBasedRlEnv, selected: SelectedActuator
+) -> tuple[torch.Tensor, tuple[Place, ...]]:
     """Return model ids and places of the effort limits of the selected targets."""
     actuator, elements = selected.actuator, selected.elements[0]
     if isinstance(actuator, IdealPdActuator):
@@ -211,6 +221,8 @@ def _limit_places(selected: SelectedActuator) -> tuple[torch.Tensor, tuple[Place
         if actuator.transmission_type == TransmissionType.JOINT:
             return indexing.joint_ids[targets].long(), _range_of("jnt_actfrcrange")
         return indexing.tendon_ids[targets].long(), _range_of("tendon_actfrcrange")
+    if isinstance(actuator, XmlActuator) and actuator.command_field == "effort":
+        return elements, _xml_effort_places(env, selected)
     if isinstance(actuator, _FORCE_LIMITED):
         return elements, _FORCE_RANGE
     if isinstance(actuator, BuiltinMotorActuator):
@@ -226,6 +238,45 @@ _FORCE_LIMITED = (
     BuiltinVelocityActuator,
     XmlActuator,
 )
+
+
+# Kinds of activation that follow the control, so that its range limits the effort too.
+_FOLLOWING = (
+    int(mujoco.mjtDyn.mjDYN_NONE),
+    int(mujoco.mjtDyn.mjDYN_FILTER),
+    int(mujoco.mjtDyn.mjDYN_FILTEREXACT),
+)
+
+
+def _xml_effort_places(env: ManagerBasedRlEnv, selected: SelectedActuator) -> tuple[Place, ...]:
+    """Return the places for XML actuators driven by effort; refuse where no place has an effect."""
+    model, ids = env.sim.mj_model, selected.elements[0].tolist()
+    muscles = [model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_MUSCLE for i in ids]
+    if all(muscles):
+        return _MUSCLE_FORCE
+    by_control = not any(muscles) and all(_is_motor(model, i) for i in ids)
+    idle = [
+        selected.actuator.target_names[target]
+        for i, target in zip(ids, selected.targets.tolist(), strict=True)
+        if not (model.actuator_forcelimited[i] or (by_control and model.actuator_ctrllimited[i]))
+    ]
+    if idle:
+        raise TypeError(
+            f"effort_limits: the XML actuators on {idle} have no effort limit that could be "
+            f"written. Give them a forcerange{' or a ctrlrange' if by_control else ''} in the XML, "
+            "or select others by name; motors and muscles have to be selected by one event each."
+        )
+    return _MOTOR_RANGES if by_control else _FORCE_RANGE
+
+
+def _is_motor(model: mujoco.MjModel, i: int) -> bool:
+    """Return whether the force of an actuator is its control times a gain."""
+    return (
+        model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
+        and int(model.actuator_dyntype[i]) in _FOLLOWING
+        and model.actuator_gainprm[i, 0] != 0.0
+    )
 
 
 def _reads(actuator: Actuator, command: CommandField, builtin: type[Actuator]) -> bool:

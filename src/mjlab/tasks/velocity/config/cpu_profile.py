@@ -1,8 +1,8 @@
-"""The `cpu` profile: settings with which a robot learns to walk on flat ground on a few cores.
+"""The `cpu` profile: settings of the velocity tasks for a few cores.
 
 A few cores step some ten thousand environments a second, a hundredth of a GPU. So a batch is small,
-and the networks are small enough for their update not to take longer than the physics. How the
-numbers were found is in `docs/velocity.md`.
+and the networks are small enough for their update not to take longer than the physics. The
+numbers are a start; how fast they learn has not been measured yet.
 """
 
 from __future__ import annotations

@@ -1,0 +1,53 @@
+"""Evaluating twice: the figures depend on the policy and the seed, not on what went before."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from velocity_tasks import GO1_FLAT, GO1_ROUGH
+
+from mjlab.rl import RslRlVecEnvWrapper
+from mjlab.rl.evaluate import evaluate_policy, make_evaluation_env
+
+
+def push(observations) -> torch.Tensor:
+    return observations["actor"][:, 9:21] * 3.0 + 0.2
+
+
+def score(env: RslRlVecEnvWrapper, **kwargs):
+    return evaluate_policy(env, push, max_steps=12, seed=7, **kwargs)
+
+
+def on_all_levels(cfg) -> None:
+    """Start on any level, so that robots that do not get far can be sent down."""
+    if cfg.scene.terrain.terrain_generator is not None:
+        cfg.scene.terrain.max_init_terrain_level = None
+
+
+@pytest.mark.parametrize("task", [GO1_FLAT, GO1_ROUGH])
+def test_evaluating_twice_with_one_seed_gives_the_same_figures(make_env, task):
+    env = RslRlVecEnvWrapper(make_env(task, edit=on_all_levels))
+    first, second = (score(env) for _ in range(2))
+    assert first.returns == second.returns
+    assert first.mean_length == second.mean_length
+    assert len(set(first.returns)) == 4
+
+
+def test_rounds_and_evaluations_leave_robots_on_the_terrain_where_they_began(make_env):
+    env = make_evaluation_env(RslRlVecEnvWrapper(make_env(GO1_ROUGH, edit=on_all_levels)), 6, 2)
+    terrain = env.unwrapped.scene.terrain
+    kept = (
+        terrain.terrain_levels.clone(),
+        terrain.terrain_types.clone(),
+        terrain.env_origins.clone(),
+    )
+    assert kept[0].max() > 0
+    score(env, num_episodes=12)
+    now = terrain.terrain_levels, terrain.terrain_types, terrain.env_origins
+    for before, after in zip(kept, now, strict=True):
+        assert torch.equal(before, after)
+    # In training they do move: nobody got far.
+    with torch.inference_mode():
+        env.reset()
+    assert (terrain.terrain_levels < kept[0]).any()
+    env.close()
