@@ -12,6 +12,8 @@ from mjlab.tasks.velocity.variants import get_sensor, remove_sensors
 
 
 def params_of(cfg, term):
+    """The parameters of a reward, which gets a weight: without one it is not checked."""
+    cfg.rewards[term].weight = cfg.rewards[term].weight or -1.0
     return cfg.rewards[term].params
 
 

@@ -147,6 +147,7 @@ def test_roll_and_pitch_rate_of_a_body_cost_and_yaw_rate_does_not(go1):
 )
 def test_several_bodies_or_none_are_refused_by_name(make_env, name, bodies, given):
     def edit(cfg):
+        cfg.rewards[name].weight = 1.0
         cfg.rewards[name].params["asset_cfg"].body_names = bodies
 
     message = f"RewardManager term '{name}': asset_cfg selects the bodies {given}.*exactly one"
