@@ -257,6 +257,20 @@ def test_a_task_may_be_solved_by_its_metrics(make_runner):
     assert waiting.last_evaluation is None
 
 
+def shorten_episodes(env_cfg) -> None:
+    env_cfg.episode_steps = 1
+
+
+def test_evaluations_may_be_harder_than_training(make_runner):
+    cfg = {"num_episodes": 4, "min_interval": 1, "solved_below": {"mean_length": 3.0}}
+    as_trained = make_runner(evaluation=asdict(EvaluationCfg(**cfg)))
+    as_trained.learn(2)
+    prepared = make_runner(evaluation=asdict(EvaluationCfg(prepare_env=shorten_episodes, **cfg)))
+    prepared.learn(2)
+    assert prepared.last_evaluation.mean_length < as_trained.last_evaluation.mean_length
+    assert prepared.env.cfg.episode_steps == as_trained.env.cfg.episode_steps
+
+
 @pytest.mark.parametrize("name", ["speed", "success_rate"])
 def test_conditions_on_what_is_not_measured_are_refused_at_once(make_runner, name):
     with pytest.raises(ValueError, match=f"names '{name}', which is not measured"):

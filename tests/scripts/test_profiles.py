@@ -12,6 +12,7 @@ import yaml
 from commands import TASK
 
 from mjlab.scripts.evaluate_run import EvaluateConfig
+from mjlab.scripts.policy import policy_env_cfg
 from mjlab.scripts.profiles import suggest_profile
 from mjlab.scripts.run_folder import read_run_info, write_run_info
 from mjlab.scripts.train_run import TrainConfig, parse_train_flags
@@ -77,6 +78,28 @@ def test_the_run_says_its_profile_and_holds_its_settings(profiled):
     assert read_run_info(profiled)["profile"] == "cpu"
     assert params(profiled, "agent")["actor"]["hidden_dims"] == [8]
     assert params(profiled, "env")["decimation"] == 3
+
+
+def shorten_episodes(env_cfg) -> None:
+    env_cfg.episode_length_s = 0.1
+
+
+def easier_in_training(env_cfg, rl_cfg) -> None:
+    env_cfg.episode_length_s = 5.0
+    rl_cfg.evaluation.prepare_env = shorten_episodes
+
+
+def test_policies_are_shown_as_evaluations_have_it_and_not_as_the_profile_trains():
+    registry.register_mjlab_task(
+        "Test-Easier",
+        registry._tasks[TASK].env_cfg,
+        rl_cfg=registry._tasks[TASK].rl_cfg,
+        profiles={"cpu": easier_in_training},
+    )
+    assert (
+        parse_train_flags("Test-Easier", ["--profile", "cpu"], "train").env.episode_length_s == 5.0
+    )
+    assert policy_env_cfg("Test-Easier", "cpu", play=False).episode_length_s == 0.1
 
 
 @pytest.mark.parametrize("script", ["train", "play", "evaluate", "train_seeds"])

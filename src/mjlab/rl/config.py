@@ -110,6 +110,12 @@ class EvaluationCfg:
     success_func: Callable[[Any], Any] | None = None
     """Instead of a return: `func(env) -> (num_envs,) bool`. The value one step before an episode
     ends decides, because the environment has reset by the time its last step returns."""
+    success_is_survival: bool = False
+    """Whether an episode is a success where no termination ended it before its time was over. Not
+    together with another condition of success."""
+    prepare_env: Callable[[Any], None] | None = None
+    """Turns, in place, a copy of the training environments' config into that of evaluations, where
+    training makes the task easier than it is. None: they are the same."""
 
 
 @dataclass

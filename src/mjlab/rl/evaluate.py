@@ -37,6 +37,7 @@ def evaluate_policy(
     max_steps: int | None = None,
     success_return: float | None = None,
     success_func: PerEnv | None = None,
+    success_is_survival: bool = False,
     metrics: Mapping[str, PerEnv] | None = None,
     seed: int | None = None,
 ) -> EvaluationResult:
@@ -57,6 +58,8 @@ def evaluate_policy(
         success_return: An episode with at least this return is a success.
         success_func: Instead, `func(env) -> (num_envs,) bool`; its value one step before the end
             of an episode decides.
+        success_is_survival: Instead, an episode that no termination ended before its time was over
+            is a success.
         metrics: For each name, `func(env) -> (num_envs,)`, read before every step and averaged over
             the steps of an episode.
         seed: Seed of the evaluation; None leaves the generators as they are.
@@ -81,6 +84,8 @@ def evaluate_policy(
             rounds.append(_play_round(env, policy, record, max_steps))
     episodes = reduce(operator.add, rounds)
     successes = episodes.succeeded if success_func is not None else None
+    if successes is None and success_is_survival:
+        successes = ~episodes.failed
     if successes is None and success_return is not None:
         successes = episodes.returns >= success_return
     return summarize(episodes, successes, time.perf_counter() - start)
@@ -193,8 +198,15 @@ def reward_unit(env: Any) -> float:
     return float(unwrapped.step_dt) if scaled else 1.0
 
 
-def make_evaluation_env(env: RslRlVecEnvWrapper, num_envs: int, seed: int) -> RslRlVecEnvWrapper:
+def make_evaluation_env(
+    env: RslRlVecEnvWrapper,
+    num_envs: int,
+    seed: int,
+    prepare: Callable[[Any], None] | None = None,
+) -> RslRlVecEnvWrapper:
     """Build environments like those of `env` beside them, to evaluate while training goes on.
+
+    `prepare` edits their config in place before.
 
     The random number generators are left as they were, so that a run takes the same course
     whether or not it is evaluated.
@@ -205,6 +217,8 @@ def make_evaluation_env(env: RslRlVecEnvWrapper, num_envs: int, seed: int) -> Rs
     cfg = copy.deepcopy(unwrapped.cfg)
     cfg.seed = seed
     cfg.scene = dataclasses.replace(cfg.scene, num_envs=num_envs)
+    if prepare is not None:
+        prepare(cfg)
     with preserved_rng():
         beside = type(unwrapped)(cfg=cfg, device=unwrapped.device)
         return RslRlVecEnvWrapper(beside, clip_actions=env.clip_actions)

@@ -73,7 +73,8 @@ class SolvedCheck:
         """Score the policy in environments of their own, built at the first call."""
         if self._beside is None:
             count = self._cfg.get("num_episodes", 256)
-            self._beside = make_evaluation_env(self._env, count, self._seed)
+            prepare = self._cfg.get("prepare_env")
+            self._beside = make_evaluation_env(self._env, count, self._seed, prepare)
         # Curricula count the steps of training.
         counter = getattr(self._env.unwrapped, "common_step_counter", None)
         if counter is not None:
@@ -91,6 +92,7 @@ class SolvedCheck:
                     policy,
                     success_return=success_return,
                     success_func=self._cfg.get("success_func"),
+                    success_is_survival=bool(self._cfg.get("success_is_survival")),
                     metrics=self._cfg.get("metrics"),
                     seed=self._seed,
                 )
@@ -108,7 +110,8 @@ class SolvedCheck:
 def _check_conditions(names: Iterable[str], cfg: dict[str, Any]) -> None:
     known = {*(cfg.get("metrics") or {}), *FIGURES}
     defining_success = ("success_func", "success_return", "solved_return")
-    if all(cfg.get(name) is None for name in defining_success):
+    is_defined = any(cfg.get(name) is not None for name in defining_success)
+    if not is_defined and not cfg.get("success_is_survival"):
         known.discard("success_rate")
     for name in names:
         if name not in known:

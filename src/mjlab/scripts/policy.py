@@ -12,6 +12,7 @@ from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.scripts.cli import UserError, tell
 from mjlab.scripts.profiles import parse_with_profile, profile_of_run
 from mjlab.scripts.run_folder import named_checkpoint, newest_checkpoint, read_agent_params
+from mjlab.scripts.task_options import prepare_env_cfg, with_task_options
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 
 # What a run's own settings may change about the task's networks: sizes and switches. Names of
@@ -20,6 +21,7 @@ _SIZES: dict[str, Callable[[Any], bool]] = {
     "hidden_dims": lambda value: isinstance(value, list) and all(_is_count(v) for v in value),
     "activation": lambda value: isinstance(value, str) and value.isidentifier(),
     "obs_normalization": lambda value: isinstance(value, bool),
+    "cnn_cfg": lambda value: value is None or (isinstance(value, dict) and _is_encoder(value)),
     "rnn_type": lambda value: value in (None, "lstm", "gru"),
     "rnn_hidden_dim": lambda value: _is_count(value),
     "rnn_num_layers": lambda value: _is_count(value),
@@ -28,6 +30,17 @@ _SIZES: dict[str, Callable[[Any], bool]] = {
 
 def _is_count(value: Any) -> bool:
     return type(value) is int and value > 0
+
+
+def _is_encoder(value: Any) -> bool:
+    """Return whether `value` is made of numbers and single words, as settings of an encoder are."""
+    if isinstance(value, dict):
+        return all(isinstance(k, str) and _is_encoder(v) for k, v in value.items())
+    if isinstance(value, list):
+        return all(_is_encoder(item) for item in value)
+    return isinstance(value, (bool, int, float)) or (
+        isinstance(value, str) and value.isidentifier()
+    )
 
 
 @dataclass
@@ -73,7 +86,9 @@ def parse_policy_flags(
         UnknownProfileError: the task has no such profile.
     """
     return parse_with_profile(
-        lambda profile: kind(env=policy_env_cfg(task, profile, play=play), profile=profile),
+        lambda profile: with_task_options(
+            kind(env=policy_env_cfg(task, profile, play=play), profile=profile), task
+        ),
         lambda cfg: profile_of_policy(task, cfg),
         flags,
         prog=f"{command} {task}",
@@ -234,17 +249,34 @@ def make_env(
     return RslRlVecEnvWrapper(env, clip_actions=clip_actions)
 
 
-def env_cfg_of(task: str, flags: PolicyFlags, *, play: bool) -> ManagerBasedRlEnvCfg:
-    """Return the environment config in `flags`, or the task's own to `play` or to train with."""
-    if flags.env is not None:
-        return flags.env
-    return policy_env_cfg(task, flags.profile, play=play)
+def env_cfg_of(
+    task: str, flags: PolicyFlags, checkpoint: Path | None, *, play: bool
+) -> ManagerBasedRlEnvCfg:
+    """Return the environment config in `flags`, or the task's own to `play` or to train with.
+
+    The task has got what it needs for the policy in `checkpoint`.
+
+    Raises:
+        ValueError: something that the task needs is not there.
+    """
+    cfg = flags.env
+    cfg = policy_env_cfg(task, flags.profile, play=play) if cfg is None else copy.deepcopy(cfg)
+    is_fetched = checkpoint is not None and flags.checkpoint_file is None
+    prepare_env_cfg(task, flags, cfg, checkpoint, flags.wandb_run_path if is_fetched else None)
+    return cfg
 
 
 def policy_env_cfg(task: str, profile: str | None, *, play: bool) -> ManagerBasedRlEnvCfg:
-    """Return the environment config of `task` under `profile`, with as many environments as the
-    task has without it: how many of them learning takes says nothing about how many to look at."""
+    """Return the environment config that shows what a policy trained under `profile` can do.
+
+    It has as many environments as the task has without the profile: how many of them learning takes
+    says nothing about how many to look at. What the profile makes easier for learning is as hard as
+    in evaluations.
+    """
     cfg = load_env_cfg(task, play=play, profile=profile)
     if profile is not None:
         cfg.scene.num_envs = load_env_cfg(task, play=play).scene.num_envs
+        prepare = load_rl_cfg(task, profile=profile).evaluation.prepare_env
+        if prepare is not None:
+            prepare(cfg)
     return cfg

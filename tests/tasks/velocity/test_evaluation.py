@@ -8,6 +8,7 @@ from velocity_tasks import GO1_FLAT, GO1_ROUGH
 
 from mjlab.rl import RslRlVecEnvWrapper
 from mjlab.rl.evaluate import evaluate_policy, make_evaluation_env
+from mjlab.utils.noise import NoiseModelWithAdditiveBiasCfg
 
 
 def push(observations) -> torch.Tensor:
@@ -51,3 +52,30 @@ def test_rounds_and_evaluations_leave_robots_on_the_terrain_where_they_began(mak
         env.reset()
     assert (terrain.terrain_levels < kept[0]).any()
     env.close()
+
+
+def test_an_environment_goes_on_without_inference_mode_after_an_evaluation(make_env):
+    """Whatever was allocated while evaluating is written again, from outside of it."""
+
+    def with_memory(cfg) -> None:
+        group = cfg.observations["actor"]
+        group.history_length = 2
+        for term in group.terms.values():
+            term.delay_max_lag, term.delay_hold_prob = 2, 0.5
+            if term.noise is not None:
+                term.noise = NoiseModelWithAdditiveBiasCfg(
+                    noise_cfg=term.noise, bias_noise_cfg=term.noise
+                )
+
+    env = make_env(GO1_ROUGH, edit=with_memory)
+    with torch.inference_mode():
+        env.reset()
+        env.step(torch.zeros(4, 12))
+        env.reset(env_ids=torch.tensor([1]))
+        env.step(torch.zeros(4, 12))
+    env.reset(env_ids=torch.tensor([0, 2]))
+    env.step(torch.zeros(4, 12))
+    env.reset()
+    for _ in range(3):
+        observations, *_ = env.step(torch.zeros(4, 12))
+    assert torch.isfinite(observations["actor"]).all()

@@ -137,7 +137,9 @@ class upright:
         """Return the reward."""
         quat = self._quat()
         if terrain_sensor_names:
-            self._normal = terrain_normal_from_sensors(env, terrain_sensor_names)
+            # Into the term's own memory: a rollout under `inference_mode` would otherwise leave a
+            # tensor that `reset` may not write afterwards.
+            self._normal.copy_(terrain_normal_from_sensors(env, terrain_sensor_names))
             tilt = quat_apply_inverse(quat, self._normal)[:, :2].square().sum(dim=1)
         else:
             tilt = tilt_of(quat)

@@ -1,0 +1,45 @@
+"""The `cpu` profile makes velocity tasks easier to learn, and not easier to pass."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import pytest
+
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
+from mjlab.tasks.velocity.config.cpu_profile import cpu
+from mjlab.utils.os import dump_yaml
+
+TASKS = [
+    f"Mjlab-Velocity-{terrain}-Unitree-{robot}"
+    for terrain in ("Flat", "Rough")
+    for robot in ("Go1", "G1")
+]
+
+
+@pytest.mark.parametrize("play", [False, True])
+@pytest.mark.parametrize("task", TASKS)
+def test_evaluations_undo_what_the_profile_eases(task, play, tmp_path):
+    env_cfg, rl_cfg = load_env_cfg(task, play=play), load_rl_cfg(task)
+    cpu(env_cfg, rl_cfg)
+    assert env_cfg.sim.mujoco.cone == "pyramidal"
+    rl_cfg.evaluation.prepare_env(env_cfg)
+    env_cfg.scene.num_envs = load_env_cfg(task, play=play).scene.num_envs
+    dump_yaml(tmp_path / "undone.yaml", asdict(env_cfg))
+    dump_yaml(tmp_path / "task.yaml", asdict(load_env_cfg(task, play=play)))
+    assert (tmp_path / "undone.yaml").read_text() == (tmp_path / "task.yaml").read_text()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_eased_rewards_end_at_the_weights_of_the_task(task):
+    env_cfg, table = load_env_cfg(task, profile="cpu"), load_env_cfg(task)
+    eased = {name for name, term in table.rewards.items() if term.weight < 0} | {"air_time"}
+    for name, term in table.rewards.items():
+        if name not in eased:
+            assert env_cfg.rewards[name].weight == term.weight
+            continue
+        stages = env_cfg.curriculum[f"eased_{name}"].params["stages"]
+        assert stages[0] == {"step": 0, "weight": env_cfg.rewards[name].weight}
+        assert stages[-1]["weight"] == pytest.approx(term.weight)
+        weights = [stage["weight"] for stage in stages]
+        assert weights == sorted(weights, reverse=True)
