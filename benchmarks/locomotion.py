@@ -1,4 +1,7 @@
-"""Speed of the velocity tasks: `env.step` over a bare `mjbatch` loop of the same model."""
+"""Speed of whole tasks: `env.step` over a bare `mjbatch` loop of the same model.
+
+Those are the velocity tasks, and lifting a cube from the state.
+"""
 
 from __future__ import annotations
 
@@ -33,11 +36,12 @@ CASES = (
     Case("Mjlab-Velocity-Flat-Unitree-Go1", "Go1 flat", 0.80),
     Case("Mjlab-Velocity-Flat-Unitree-G1", "G1 flat", 0.85),
     Case("Mjlab-Velocity-Rough-Unitree-Go1", "Go1 rough with its height scan", 0.75, True),
+    Case("Mjlab-Lift-Cube-Yam", "Lift cube from state", 0.80),
 )
 
 
 def make_env(task: str, num_envs: int) -> ManagerBasedRlEnv:
-    """Return the task's environments, standing on the ground."""
+    """Return the task's environments, just reset."""
     cfg = load_env_cfg(task)
     cfg.scene.num_envs = num_envs
     cfg.sim.num_threads = NUM_THREADS
@@ -76,8 +80,8 @@ def measure_case(case: Case) -> Row:
     bare.expand({name: getattr(env.sim.model, name) for name in env.sim.expanded_fields})
 
     def same_states() -> None:
-        for name in ("qpos", "qvel", "ctrl"):
-            getattr(bare, name)[:] = getattr(env.sim.data, name).numpy()
+        for name, values in bare.state.items():
+            values[:] = getattr(env.sim.data, name).numpy()
 
     if case.with_rays:
         for origins, directions, groups, *_ in recorded_rays(env):

@@ -52,8 +52,12 @@ class BareLoop:
     ) -> None:
         self._batch = mjbatch.Batch(model, num_envs, num_threads)
         self._decimation = decimation
-        self.qpos, self.ctrl = self._batch.bind("qpos"), self._batch.bind("ctrl")
-        self.qvel = self._batch.bind("qvel")
+        names = ["qpos", "qvel", "ctrl"]
+        if model.nmocap > 0:
+            # Where the bases of arms are.
+            names += ["mocap_pos", "mocap_quat"]
+        self.state = {name: self._batch.bind(name) for name in names}
+        self.qpos, self.qvel, self.ctrl = (self.state[name] for name in names[:3])
         self._rays: list[dict[str, np.ndarray]] = []
 
     def expand(self, fields: Mapping[str, torch.Tensor]) -> None:

@@ -1,7 +1,7 @@
 """Comparing a robot's compiled model with a table of its figures.
 
 A table is a YAML file in `figures/`: bodies with their joints, geoms, sites and cameras, then
-sensors, contact excludes and totals. What it leaves out has MuJoCo's default. The geoms of a table
+sensors, equalities, contact excludes and totals. What it leaves out has MuJoCo's default. The geoms of a table
 are those that can touch something; others are drawn only, and the table says how far they reach
 (`visual_extent`).
 """
@@ -26,6 +26,10 @@ _IDENTITY = [1.0, 0.0, 0.0, 0.0]
 _ZERO = [0.0, 0.0, 0.0]
 # How many sizes a geom of each type has; MuJoCo keeps three, and fills the rest.
 _NUM_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
+# What a body weighs for which the table says nothing of it.
+_MASSLESS = {"mass": 0.0, "inertia": _ZERO}
+# How many numbers the coupling of two joints takes: the coefficients of a polynomial.
+_NUM_COEFFICIENTS = 5
 _NOT_FIGURES = {"source_of_figures", "conventions"}
 
 
@@ -44,7 +48,8 @@ def compare(figures: dict[str, Any], table: dict[str, Any]) -> list[str]:
     """Return, one line each, where the figures of a model differ from the table."""
     expected = {key: value for key, value in table.items() if key not in _NOT_FIGURES}
     expected["bodies"] = [_completed(body) for body in table["bodies"]]
-    expected.setdefault("contact_excludes", [])
+    for kind in ("sensors", "equalities", "contact_excludes"):
+        expected.setdefault(kind, [])
     return list(_compare(expected, figures, ""))
 
 
@@ -53,6 +58,7 @@ def figures_of(model: mujoco.MjModel) -> dict[str, Any]:
     return {
         "bodies": [_body(model, index) for index in range(1, model.nbody)],
         "sensors": [_sensor(model, index) for index in range(model.nsensor)],
+        "equalities": [_equality(model, index) for index in range(model.neq)],
         "contact_excludes": [
             [model.body(signature >> 16).name, model.body(signature & 0xFFFF).name]
             for signature in model.exclude_signature
@@ -68,11 +74,14 @@ def figures_of(model: mujoco.MjModel) -> dict[str, Any]:
 
 def _body(model: mujoco.MjModel, index: int) -> dict[str, Any]:
     figures = _figures(model, "body", index, "pos", "quat", "mass", "ipos", "iquat", "inertia")
-    figures["inertial_pos"] = figures.pop("ipos")
-    figures["inertial_quat"] = figures.pop("iquat")
+    placed = ("pos", "quat")
+    for field in placed:
+        figures[f"inertial_{field}"] = figures.pop(f"i{field}")
+        if model.body_mass[index] == 0.0:
+            # Without mass, it is anywhere.
+            del figures[f"inertial_{field}"]
     figures["parent"] = model.body(model.body_parentid[index]).name
     felt = (model.geom_bodyid == index) & (model.geom_group != VISUAL_GROUP)
-    placed = ("pos", "quat")
     return figures | {
         "joints": [_joint(model, i) for i in np.flatnonzero(model.jnt_bodyid == index)],
         "geoms": [_geom(model, i) for i in np.flatnonzero(felt)],
@@ -120,6 +129,17 @@ def _sensor(model: mujoco.MjModel, index: int) -> dict[str, Any]:
     return found
 
 
+def _equality(model: mujoco.MjModel, index: int) -> dict[str, Any]:
+    if model.eq_type[index] != mujoco.mjtEq.mjEQ_JOINT:
+        raise ValueError("Of equalities, only the coupling of two joints is compared here.")
+    figures = _figures(model, "eq", index, "type", "solref", "solimp")
+    return figures | {
+        "obj1": model.joint(model.eq_obj1id[index]).name,
+        "obj2": model.joint(model.eq_obj2id[index]).name,
+        "data": model.eq_data[index, :_NUM_COEFFICIENTS].tolist(),
+    }
+
+
 def _completed(body: dict[str, Any]) -> dict[str, Any]:
     """Return a body of a table with what it leaves out."""
     body = {key: value for key, value in body.items() if key != "visual_extent"}
@@ -130,7 +150,7 @@ def _completed(body: dict[str, Any]) -> dict[str, Any]:
         joint if joint["type"] == "free" else {"pos": _ZERO, "range": None} | joint
         for joint in body.get("joints", [])
     ]
-    return placed | body
+    return placed | ({} if "mass" in body else _MASSLESS) | body
 
 
 def _compare(expected: Any, found: Any, path: str) -> Iterator[str]:

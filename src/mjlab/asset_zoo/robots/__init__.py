@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING
 from mjlab.utils.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from mjlab.asset_zoo.robots.i2rt_yam.yam_constants import (
+        get_yam_robot_cfg as get_yam_robot_cfg,
+    )
     from mjlab.asset_zoo.robots.unitree_g1.g1_constants import (
         get_g1_robot_cfg as get_g1_robot_cfg,
     )
@@ -20,6 +23,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "get_g1_robot_cfg": "mjlab.asset_zoo.robots.unitree_g1.g1_constants",
     "get_go1_robot_cfg": "mjlab.asset_zoo.robots.unitree_go1.go1_constants",
+    "get_yam_robot_cfg": "mjlab.asset_zoo.robots.i2rt_yam.yam_constants",
 }
 
 __all__ = sorted(_HOMES)

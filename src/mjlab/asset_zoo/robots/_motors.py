@@ -25,9 +25,9 @@ DAMPING_RATIO = 2.0
 _ACTION_EFFORT_SHARE = 0.25
 
 
-def gains(inertia: float) -> tuple[float, float]:
-    """Return stiffness, N m/rad, and damping, N m s/rad, for a motor's inertia at the joint."""
-    return inertia * NATURAL_FREQ**2, 2.0 * DAMPING_RATIO * inertia * NATURAL_FREQ
+def gains(inertia: float, natural_freq: float = NATURAL_FREQ) -> tuple[float, float]:
+    """Return stiffness, N m/rad, and damping, N m s/rad, for an inertia at the joint."""
+    return inertia * natural_freq**2, 2.0 * DAMPING_RATIO * inertia * natural_freq
 
 
 def position_actuator(

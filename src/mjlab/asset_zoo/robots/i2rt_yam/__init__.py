@@ -1,0 +1,1 @@
+"""The I2RT YAM, an arm of six joints with a gripper."""

@@ -1,0 +1,189 @@
+"""The I2RT YAM: its motors, gains, pose and collision setups.
+
+Each joint of the arm, and the left finger, is a position actuator, that is a spring and a damper
+towards the commanded angle. The right finger has none: the gripper's one motor moves both fingers,
+which the model ties by an equality. The gains follow from the inertia I that there is to move:
+
+    stiffness = I w^2,  damping = 2 z I w,
+
+with the natural frequency w (`NATURAL_FREQ`, for the fingers `NATURAL_FREQ_GRIPPER`) and the
+damping ratio z (`DAMPING_RATIO`). Unlike a walking robot's, which is that of the motor alone, it is
+the inertia of all that the joint carries: an arm moves slowly, and its motors are light. Torques are
+in N m, angles in rad, lengths in m, forces in N.
+"""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import mujoco
+
+from mjlab.actuator import BuiltinPositionActuatorCfg
+from mjlab.asset_zoo.robots._motors import DAMPING_RATIO as DAMPING_RATIO
+from mjlab.asset_zoo.robots._motors import action_scale, gains
+from mjlab.compat import older_names
+from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
+from mjlab.utils.actuator import ElectricActuator, reflect_rotary_to_linear
+from mjlab.utils.spec_config import CollisionCfg
+
+# The model.
+
+YAM_XML = Path(__file__).parent / "xmls" / "yam.xml"
+
+
+def get_spec() -> mujoco.MjSpec:
+    """Return a new spec of the robot, without actuators: the config adds them."""
+    return mujoco.MjSpec.from_file(str(YAM_XML))
+
+
+# Motors. Their makers state the inertia behind the gear.
+
+ARMATURE_DM_4340 = 0.032
+"""Inertia of the motors of joints 1 to 3, kg m^2."""
+ARMATURE_DM_4310 = 0.0018
+"""Inertia of the motors of joints 4 to 6 and of the gripper, kg m^2."""
+
+ACTUATOR_DM_4340 = ElectricActuator(
+    reflected_inertia=ARMATURE_DM_4340, velocity_limit=10.0, effort_limit=28.0
+)
+"""The motor of joints 1 to 3."""
+ACTUATOR_DM_4310 = ElectricActuator(
+    reflected_inertia=ARMATURE_DM_4310, velocity_limit=30.0, effort_limit=10.0
+)
+"""The motor of joints 4 to 6, and of the gripper before its crank."""
+
+# The gripper: a crank turns the motor's angle into the travel of the fingers.
+
+GRIPPER_LINEAR_STROKE_CRANK = 0.071
+"""How far the crank moves the fingers apart, m."""
+GRIPPER_MOTOR_STROKE_CRANK = 2.7
+"""How far the motor turns for that, rad."""
+GRIPPER_TRANSMISSION_RATIO_CRANK = GRIPPER_LINEAR_STROKE_CRANK / GRIPPER_MOTOR_STROKE_CRANK
+"""Travel for a turn of the motor, m/rad."""
+(
+    ARMATURE_DM_4310_LINEAR_CRANK,
+    VELOCITY_LIMIT_DM_4310_LINEAR_CRANK,
+    EFFORT_LIMIT_DM_4310_LINEAR_CRANK,
+) = reflect_rotary_to_linear(
+    ACTUATOR_DM_4310.reflected_inertia,
+    ACTUATOR_DM_4310.velocity_limit,
+    ACTUATOR_DM_4310.effort_limit,
+    GRIPPER_TRANSMISSION_RATIO_CRANK,
+)
+"""The motor as the fingers see it: kg, m/s and N."""
+EFFORT_LIMIT_DM_4310_LINEAR_CRANK_SAFE = EFFORT_LIMIT_DM_4310_LINEAR_CRANK * 0.1
+"""The force that the gripper may use, N: a tenth of what the motor could do."""
+
+# Gains.
+
+NATURAL_FREQ = 2 * 2.0 * 3.1415926535
+"""Natural frequency of the arm's joints, 2 Hz in rad/s. (Policies are trained with pi as here.)"""
+NATURAL_FREQ_GRIPPER = 1 * 2.0 * 3.1415926535
+"""Natural frequency of the fingers, 1 Hz in rad/s."""
+
+EFFECTIVE_INERTIAS = {
+    "joint1": 0.123153,
+    "joint2": 0.277411,
+    "joint3": 0.232763,
+    "joint4": 0.030154,
+    "joint5": 0.009126,
+    "joint6": 0.002868,
+    "left_finger": 2.781624,
+}
+"""What each actuator moves: the diagonal of the mass matrix in the pose to start from, with that of
+the motors, in kg m^2 (the finger: kg)."""
+STIFFNESS_GRIPPER, DAMPING_GRIPPER = gains(EFFECTIVE_INERTIAS["left_finger"], NATURAL_FREQ_GRIPPER)
+"""Gains of the fingers, N/m and N s/m."""
+
+
+def _joint_actuator(joint: str, motor: ElectricActuator) -> BuiltinPositionActuatorCfg:
+    stiffness, damping = gains(EFFECTIVE_INERTIAS[joint], NATURAL_FREQ)
+    return BuiltinPositionActuatorCfg(
+        target_names_expr=(joint,),
+        stiffness=stiffness,
+        damping=damping,
+        effort_limit=motor.effort_limit,
+        armature=motor.reflected_inertia,
+    )
+
+
+ARM_ACTUATORS = (
+    *(_joint_actuator(f"joint{number}", ACTUATOR_DM_4340) for number in (1, 2, 3)),
+    *(_joint_actuator(f"joint{number}", ACTUATOR_DM_4310) for number in (4, 5, 6)),
+)
+"""Actuators of the arm, one for each joint."""
+GRIPPER_ACTUATOR = BuiltinPositionActuatorCfg(
+    target_names_expr=("left_finger",),
+    stiffness=STIFFNESS_GRIPPER,
+    damping=DAMPING_GRIPPER,
+    effort_limit=EFFORT_LIMIT_DM_4310_LINEAR_CRANK_SAFE,
+    armature=ARMATURE_DM_4310_LINEAR_CRANK,
+)
+"""Actuator of the gripper, at the left finger."""
+ARTICULATION = EntityArticulationInfoCfg(
+    actuators=(*ARM_ACTUATORS, GRIPPER_ACTUATOR), soft_joint_pos_limit_factor=0.9
+)
+"""All actuators."""
+
+YAM_ACTION_SCALE = action_scale((*ARM_ACTUATORS, GRIPPER_ACTUATOR))
+"""Scale of joint position actions by joint, rad per unit of action (the finger: m)."""
+
+# The pose to start from.
+
+HOME_KEYFRAME = EntityCfg.InitialStateCfg(
+    pos=(0.0, 0.0, 0.01),
+    joint_pos={
+        "joint2": 1.047,
+        "joint3": 1.05,
+        "joint4": -0.9,
+        # Half open.
+        "left_finger": 0.0375 / 2,
+        "right_finger": -0.0375 / 2,
+    },
+)
+"""Forearm level, gripper half open, 21 cm above the ground and pointing at it. The foot of the arm
+stands on the ground."""
+
+# Collision setups.
+
+_FINGERTIPS_REGEX = r"[lr]f_down(6|7|8|9|10|11)_collision"
+_GRIPPER_REGEX = r"(link6|[lr]f)_.*_collision"
+_ALL_REGEX = r".*_collision"
+
+
+def _collision(contype: int | dict[str, int]) -> CollisionCfg:
+    return CollisionCfg(
+        geom_names_expr=(_ALL_REGEX,),
+        contype=contype,
+        conaffinity=copy.copy(contype),
+        # Fingertips hold what they touch: their friction counts, also against spinning and rolling.
+        condim={_FINGERTIPS_REGEX: 6, _ALL_REGEX: 3},
+        priority={_FINGERTIPS_REGEX: 1, ".*": 0},
+        friction={_FINGERTIPS_REGEX: (1, 5e-3, 5e-4), _ALL_REGEX: (0.6,)},
+        solref={_FINGERTIPS_REGEX: (0.01, 1)},
+    )
+
+
+FULL_COLLISION = _collision(1)
+"""Everything collides, the arm with itself too."""
+GRIPPER_ONLY_COLLISION = _collision({_GRIPPER_REGEX: 1, _ALL_REGEX: 0})
+"""Only the gripper collides."""
+
+# The robot.
+
+
+def get_yam_robot_cfg() -> EntityCfg:
+    """Return a new config of the robot, at its home pose, whose gripper alone collides.
+
+    It shares nothing with the constants of this module: what a task changes in it stays there.
+    """
+    return EntityCfg(
+        init_state=copy.deepcopy(HOME_KEYFRAME),
+        collisions=(copy.deepcopy(GRIPPER_ONLY_COLLISION),),
+        spec_fn=get_spec,
+        articulation=copy.deepcopy(ARTICULATION),
+    )
+
+
+__getattr__ = older_names(__name__)

@@ -1,0 +1,1 @@
+"""The robots that the manipulation tasks come with, one package each."""

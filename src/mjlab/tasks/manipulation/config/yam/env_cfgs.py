@@ -1,0 +1,249 @@
+"""The manipulation tasks of the YAM arm."""
+
+from __future__ import annotations
+
+import colorsys
+from typing import Literal
+
+import mujoco
+
+from mjlab.asset_zoo.robots import get_yam_robot_cfg
+from mjlab.asset_zoo.robots.i2rt_yam.yam_constants import YAM_ACTION_SCALE
+from mjlab.entity import EntityCfg
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.managers import (
+    EventTermCfg,
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    RewardTermCfg,
+    SceneEntityCfg,
+)
+from mjlab.sensor import CameraSensorCfg, ContactSensorCfg
+from mjlab.tasks.manipulation import mdp
+from mjlab.tasks.manipulation.lift_cube_env_cfg import make_lift_cube_env_cfg
+
+_HAND = ("grasp_site",)
+_FINGERTIPS = "[lr]f_down(6|7|8|9|10|11)_collision"
+_CAMERA = "camera_d405"
+_IMAGE_SIZE = 32
+# What the camera sees: ground and cubes (0), and what of the arm can touch something (3).
+_SEEN_GROUPS = (0, 3)
+_DEPTH_CUTOFF = 0.5
+_PLAY_GOAL_TIME = 4.0
+# Contacts that Warp reserves for each cube: it can touch all of the gripper and the other cubes.
+_CONTACTS_PER_CUBE = 120
+
+
+def get_cube_spec(
+    cube_size: float = 0.02,
+    mass: float = 0.05,
+    rgba: tuple[float, float, float, float] = (0.8, 0.2, 0.2, 1.0),
+) -> mujoco.MjSpec:
+    """Return a new spec of a cube that floats.
+
+    Args:
+        cube_size: Half the length of an edge, in metres.
+        mass: Mass, in kg.
+        rgba: Red, green, blue and opacity.
+    """
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body(name="cube")
+    body.add_freejoint(name="cube_joint")
+    body.add_geom(
+        name="cube_geom",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=(cube_size,) * 3,
+        mass=mass,
+        rgba=rgba,
+    )
+    return spec
+
+
+def yam_lift_cube_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
+    """Return the task from the state, to train or to `play` with."""
+    cfg = make_lift_cube_env_cfg()
+    cfg.scene.entities = {
+        "robot": get_yam_robot_cfg(),
+        "cube": EntityCfg(spec_fn=get_cube_spec),
+    }
+    joint_pos = cfg.actions["joint_pos"]
+    assert isinstance(joint_pos, mdp.JointPositionActionCfg)
+    joint_pos.scale = dict(YAM_ACTION_SCALE)
+    for group in ("actor", "critic"):
+        _terms(cfg, group)["ee_to_cube"].params["asset_cfg"].site_names = _HAND
+    _reward(cfg, "lift").params["asset_cfg"].site_names = _HAND
+    for name in ("slide", "spin", "roll"):
+        event = cfg.events[f"fingertip_friction_{name}"]
+        assert event is not None
+        event.params["asset_cfg"].geom_names = _FINGERTIPS
+    (hand_on_the_ground,) = cfg.scene.sensors
+    assert isinstance(hand_on_the_ground, ContactSensorCfg)
+    hand_on_the_ground.primary.pattern = "link_6"
+    cfg.viewer.body_name = "arm"
+    if play:
+        _make_playable(cfg)
+    return cfg
+
+
+def yam_lift_cube_vision_env_cfg(
+    cam_type: Literal["rgb", "depth"], play: bool = False
+) -> ManagerBasedRlEnvCfg:
+    """Return the task from images of the wrist camera, to train or to `play` with.
+
+    The actor does not know where the cube is, except from the image; the critic does.
+
+    Raises:
+        ValueError: `cam_type` is neither `rgb` nor `depth`.
+    """
+    if cam_type not in ("rgb", "depth"):
+        raise ValueError(f"cam_type is {cam_type!r}; it has to be 'rgb' or 'depth'.")
+    cfg = yam_lift_cube_env_cfg(play=play)
+    cfg.scene.sensors += (_camera((cam_type,)),)
+    if cam_type == "rgb":
+        image = ObservationTermCfg(func=mdp.camera_rgb, params={"sensor_name": _CAMERA})
+        cfg.events["cube_color"] = _any_color()
+    else:
+        image = _depth_image()
+    cfg.observations["camera"] = ObservationGroupCfg(
+        terms={f"{_CAMERA}_{cam_type}": image}, enable_corruption=False
+    )
+    _hide_the_cube(cfg, "actor")
+    return cfg
+
+
+def yam_lift_cube_rgb_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
+    """Return the task from colour images."""
+    return yam_lift_cube_vision_env_cfg("rgb", play=play)
+
+
+def yam_lift_cube_depth_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
+    """Return the task from depth images."""
+    return yam_lift_cube_vision_env_cfg("depth", play=play)
+
+
+def yam_multi_cube_seg_env_cfg(num_cubes: int = 3, play: bool = False) -> ManagerBasedRlEnvCfg:
+    """Return the task of lifting one out of several cubes, to train or to `play` with.
+
+    Images are of depth, and a mask that says which cube is wanted.
+
+    Raises:
+        ValueError: `num_cubes` is below 1.
+    """
+    if num_cubes < 1:
+        raise ValueError(f"num_cubes is {num_cubes}; there has to be at least 1 to lift.")
+    cfg = yam_lift_cube_env_cfg(play=play)
+    del cfg.scene.entities["cube"]
+    cubes = tuple(f"cube_{index}" for index in range(num_cubes))
+    for index, name in enumerate(cubes):
+        color = (*colorsys.hsv_to_rgb(index / num_cubes, 0.8, 0.9), 1.0)
+        cfg.scene.entities[name] = EntityCfg(spec_fn=lambda rgba=color: get_cube_spec(rgba=rgba))
+    cfg.sim.nconmax = max(cfg.sim.nconmax or 0, 55 + _CONTACTS_PER_CUBE * num_cubes)
+    _want_one_of(cfg, cubes)
+    cfg.scene.sensors += (_camera(("depth", "segmentation")),)
+    mask = ObservationTermCfg(
+        func=mdp.camera_target_cube_mask,
+        params={"sensor_name": _CAMERA, "command_name": "lift_height"},
+    )
+    cfg.observations["camera"] = ObservationGroupCfg(
+        terms={"depth": _depth_image(), "target_mask": mask},
+        enable_corruption=False,
+        # Of one environment's image: the channels.
+        concatenate_dim=0,
+    )
+    for group in ("actor", "critic"):
+        _hide_the_cube(cfg, group)
+    return cfg
+
+
+def _want_one_of(cfg: ManagerBasedRlEnvCfg, cubes: tuple[str, ...]) -> None:
+    """Replace command and rewards about the cube by those about one of several."""
+    command = cfg.commands["lift_height"]
+    assert isinstance(command, mdp.LiftingCommandCfg)
+    cfg.commands["lift_height"] = mdp.MultiCubeLiftingCommandCfg(
+        entity_names=cubes,
+        resampling_time_range=command.resampling_time_range,
+        debug_vis=command.debug_vis,
+        difficulty=command.difficulty,
+    )
+    for name, func in (
+        ("lift", mdp.multi_cube_staged_position_reward),
+        ("lift_precise", mdp.multi_cube_bring_object_reward),
+    ):
+        old = _reward(cfg, name)
+        params = {key: value for key, value in old.params.items() if key != "object_name"}
+        cfg.rewards[name] = RewardTermCfg(func=func, weight=old.weight, params=params)
+
+
+def _hide_the_cube(cfg: ManagerBasedRlEnvCfg, group: str) -> None:
+    """Let a group know the goal, as the hand sees it, in place of anything about the cube."""
+    terms = _terms(cfg, group)
+    del terms["ee_to_cube"], terms["cube_to_goal"]
+    terms["goal_position"] = ObservationTermCfg(
+        func=mdp.target_position,
+        params={
+            "command_name": "lift_height",
+            "asset_cfg": SceneEntityCfg("robot", site_names=_HAND),
+        },
+    )
+
+
+def _camera(data_types: tuple[Literal["rgb", "depth", "segmentation"], ...]) -> CameraSensorCfg:
+    return CameraSensorCfg(
+        name=_CAMERA,
+        camera_name=f"robot/{_CAMERA}",
+        width=_IMAGE_SIZE,
+        height=_IMAGE_SIZE,
+        data_types=data_types,
+        use_textures=True,
+        use_shadows=False,
+        enabled_geom_groups=_SEEN_GROUPS,
+    )
+
+
+def _depth_image() -> ObservationTermCfg:
+    return ObservationTermCfg(
+        func=mdp.camera_depth,
+        params={"sensor_name": _CAMERA, "cutoff_distance": _DEPTH_CUTOFF},
+    )
+
+
+def _any_color() -> EventTermCfg:
+    return EventTermCfg(
+        func=mdp.dr.geom_rgba,
+        mode="reset",
+        params={
+            "asset_cfg": SceneEntityCfg("cube", geom_names=(".*",)),
+            "operation": "abs",
+            "distribution": "uniform",
+            "axes": [0, 1, 2],
+            "ranges": (0.0, 1.0),
+        },
+    )
+
+
+def _make_playable(cfg: ManagerBasedRlEnvCfg) -> None:
+    """Turn a config to train with into one to look at what was learned.
+
+    Episodes do not end by time, observations are without noise, and goals change often.
+    """
+    cfg.episode_length_s = int(1e9)
+    actor = cfg.observations["actor"]
+    assert actor is not None
+    actor.enable_corruption = False
+    cfg.curriculum = {}
+    command = cfg.commands["lift_height"]
+    assert command is not None
+    command.resampling_time_range = (_PLAY_GOAL_TIME, _PLAY_GOAL_TIME)
+
+
+def _terms(cfg: ManagerBasedRlEnvCfg, group: str) -> dict[str, ObservationTermCfg]:
+    found = cfg.observations[group]
+    assert found is not None
+    # None of them is switched off here.
+    return found.terms  # ty: ignore[invalid-explicit-return]
+
+
+def _reward(cfg: ManagerBasedRlEnvCfg, name: str) -> RewardTermCfg:
+    found = cfg.rewards[name]
+    assert found is not None
+    return found

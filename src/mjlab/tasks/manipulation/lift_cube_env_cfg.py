@@ -1,0 +1,242 @@
+"""The base config of the lifting task: bring a cube from the table to a goal in the air.
+
+A robot's package starts from `make_lift_cube_env_cfg()` and fills in what depends on the robot. See
+`config/yam`.
+"""
+
+from __future__ import annotations
+
+import copy
+
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.managers import (
+    ActionTermCfg,
+    CommandTermCfg,
+    CurriculumTermCfg,
+    EventTermCfg,
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    RewardTermCfg,
+    SceneEntityCfg,
+    TerminationTermCfg,
+)
+from mjlab.scene import SceneCfg
+from mjlab.sensor import ContactMatch, ContactSensorCfg
+from mjlab.sim import MujocoCfg, SimulationCfg
+from mjlab.tasks.manipulation import mdp
+from mjlab.terrains import TerrainEntityCfg
+from mjlab.utils.noise import UniformNoiseCfg
+from mjlab.viewer import ViewerConfig
+
+# Filled in by the robot.
+_NO_NAMES: tuple[str, ...] = ()
+_NO_BODY = "(body of the hand)"
+
+
+def make_lift_cube_env_cfg() -> ManagerBasedRlEnvCfg:
+    """Return a new config of the task, without a robot and a cube.
+
+    It shares nothing with other configs, so that all of it may be edited. To be filled in are:
+
+    - `scene.entities["robot"]` and `scene.entities["cube"]`;
+    - the action's scale; the site of the observations `ee_to_cube` and of the reward `lift`; the
+      geoms of the events `fingertip_friction_*`; the primary of the sensor `ee_ground_collision`;
+    - `viewer.body_name`.
+
+    Sites and sensors left empty are refused when the environment is built. Events without geoms
+    change nothing, and there is a warning.
+    """
+    return ManagerBasedRlEnvCfg(
+        decimation=4,
+        episode_length_s=20.0,
+        scene=SceneCfg(
+            terrain=TerrainEntityCfg(terrain_type="plane"),
+            sensors=(_hand_on_the_ground(),),
+            num_envs=1,
+            env_spacing=1.0,
+        ),
+        observations=_observations(),
+        actions=_actions(),
+        commands=_commands(),
+        events=_events(),
+        rewards=_rewards(),
+        terminations=_terminations(),
+        curriculum=_curriculum(),
+        sim=SimulationCfg(
+            nconmax=55,
+            njmax=600,
+            mujoco=MujocoCfg(
+                timestep=0.005, iterations=10, ls_iterations=20, impratio=10, cone="elliptic"
+            ),
+        ),
+        viewer=ViewerConfig(
+            origin_type=ViewerConfig.OriginType.ASSET_BODY,
+            entity_name="robot",
+            body_name="",
+            distance=1.5,
+            elevation=-5.0,
+            azimuth=120.0,
+        ),
+    )
+
+
+def _hand_on_the_ground() -> ContactSensorCfg:
+    """Return a sensor of the hand's strongest contact with the ground, in every substep."""
+    return ContactSensorCfg(
+        name="ee_ground_collision",
+        primary=ContactMatch(mode="subtree", pattern=_NO_BODY, entity="robot"),
+        secondary=ContactMatch(mode="body", pattern="terrain"),
+        fields=("found", "force"),
+        reduce="maxforce",
+        num_slots=1,
+        history_length=4,
+    )
+
+
+def _hand() -> SceneEntityCfg:
+    return SceneEntityCfg("robot", site_names=_NO_NAMES)
+
+
+def _noise(size: float) -> UniformNoiseCfg:
+    return UniformNoiseCfg(n_min=-size, n_max=size)
+
+
+def _observations() -> dict[str, ObservationGroupCfg | None]:
+    terms: dict[str, ObservationTermCfg | None] = {
+        "joint_pos": ObservationTermCfg(func=mdp.joint_pos_rel, noise=_noise(0.01)),
+        "joint_vel": ObservationTermCfg(func=mdp.joint_vel_rel, noise=_noise(1.5)),
+        "ee_to_cube": ObservationTermCfg(
+            func=mdp.ee_to_object_distance,
+            params={"object_name": "cube", "asset_cfg": _hand()},
+            noise=_noise(0.01),
+        ),
+        "cube_to_goal": ObservationTermCfg(
+            func=mdp.object_to_goal_distance,
+            params={"object_name": "cube", "command_name": "lift_height"},
+            noise=_noise(0.01),
+        ),
+        "actions": ObservationTermCfg(func=mdp.last_action),
+    }
+    # The critic sees the same without noise: its group has no corruption.
+    return {
+        "actor": ObservationGroupCfg(terms=terms, enable_corruption=True),
+        "critic": ObservationGroupCfg(terms=copy.deepcopy(terms)),
+    }
+
+
+def _actions() -> dict[str, ActionTermCfg | None]:
+    return {
+        "joint_pos": mdp.JointPositionActionCfg(
+            entity_name="robot", actuator_names=(".*",), scale=0.5, use_default_offset=True
+        )
+    }
+
+
+def _commands() -> dict[str, CommandTermCfg | None]:
+    return {
+        "lift_height": mdp.LiftingCommandCfg(
+            entity_name="cube",
+            resampling_time_range=(8.0, 12.0),
+            debug_vis=True,
+            difficulty="dynamic",
+            object_pose_range=mdp.LiftingCommandCfg.ObjectPoseRangeCfg(
+                x=(0.2, 0.4), y=(-0.2, 0.2), z=(0.02, 0.05), yaw=(-3.14, 3.14)
+            ),
+        )
+    }
+
+
+def _events() -> dict[str, EventTermCfg | None]:
+    return {
+        "reset_base": EventTermCfg(
+            func=mdp.reset_root_state_uniform,
+            mode="reset",
+            params={"pose_range": {}, "velocity_range": {}},
+        ),
+        "reset_robot_joints": EventTermCfg(
+            func=mdp.reset_joints_by_offset,
+            mode="reset",
+            params={
+                "position_range": (0.0, 0.0),
+                "velocity_range": (0.0, 0.0),
+                "asset_cfg": SceneEntityCfg("robot", joint_names=(".*",)),
+            },
+        ),
+        # Fingertips of condim 6 also resist spinning and rolling, which spread over orders of
+        # magnitude. Each of them has a friction of its own.
+        "fingertip_friction_slide": _fingertip_friction(0, (0.3, 1.5), "uniform"),
+        "fingertip_friction_spin": _fingertip_friction(1, (1e-4, 2e-2), "log_uniform"),
+        "fingertip_friction_roll": _fingertip_friction(2, (1e-5, 5e-3), "log_uniform"),
+    }
+
+
+def _fingertip_friction(axis: int, ranges: tuple[float, float], distribution: str) -> EventTermCfg:
+    return EventTermCfg(
+        func=mdp.dr.geom_friction,
+        mode="startup",
+        params={
+            "asset_cfg": SceneEntityCfg("robot", geom_names=_NO_NAMES),
+            "operation": "abs",
+            "distribution": distribution,
+            "axes": [axis],
+            "ranges": ranges,
+        },
+    )
+
+
+def _rewards() -> dict[str, RewardTermCfg | None]:
+    def of_joints() -> SceneEntityCfg:
+        return SceneEntityCfg("robot", joint_names=(".*",))
+
+    return {
+        "lift": RewardTermCfg(
+            func=mdp.staged_position_reward,
+            weight=1.0,
+            params={
+                "command_name": "lift_height",
+                "object_name": "cube",
+                "reaching_std": 0.2,
+                "bringing_std": 0.3,
+                "asset_cfg": _hand(),
+            },
+        ),
+        "lift_precise": RewardTermCfg(
+            func=mdp.bring_object_reward,
+            weight=1.0,
+            params={"command_name": "lift_height", "object_name": "cube", "std": 0.05},
+        ),
+        "action_rate_l2": RewardTermCfg(func=mdp.action_rate_l2, weight=-0.01),
+        "joint_pos_limits": RewardTermCfg(
+            func=mdp.joint_pos_limits, weight=-10.0, params={"asset_cfg": of_joints()}
+        ),
+        "joint_vel_hinge": RewardTermCfg(
+            func=mdp.joint_velocity_hinge_penalty,
+            weight=-0.01,
+            params={"max_vel": 0.5, "asset_cfg": of_joints()},
+        ),
+    }
+
+
+def _terminations() -> dict[str, TerminationTermCfg | None]:
+    return {
+        "time_out": TerminationTermCfg(func=mdp.time_out, time_out=True),
+        "ee_ground_collision": TerminationTermCfg(
+            func=mdp.illegal_contact,
+            params={"sensor_name": "ee_ground_collision", "force_threshold": 10.0},
+        ),
+    }
+
+
+def _curriculum() -> dict[str, CurriculumTermCfg | None]:
+    # First to lift at all, then gently. In environment steps: iterations of 24 steps.
+    stages: list[mdp.RewardCurriculumStage] = [
+        {"step": 0, "weight": -0.01},
+        {"step": 500 * 24, "weight": -0.1},
+        {"step": 1000 * 24, "weight": -1.0},
+    ]
+    return {
+        "joint_vel_hinge_weight": CurriculumTermCfg(
+            func=mdp.reward_curriculum,
+            params={"reward_name": "joint_vel_hinge", "stages": stages},
+        )
+    }

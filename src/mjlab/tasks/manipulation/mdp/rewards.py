@@ -1,0 +1,110 @@
+"""Reward terms of the manipulation tasks. Each returns (N,), before its weight.
+
+The end effector is the selected site of `asset_cfg`. Positions are those of before the last physics
+substep, of hand and object alike.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from mjlab.envs.mdp._indexing import columns
+from mjlab.managers.build_checks import checked_when_built
+from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.tasks.manipulation.mdp._shared import (
+    check_multi,
+    check_single,
+    lifting_command,
+    multi_cube_command,
+    site_pos,
+)
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+    from mjlab.envs import ManagerBasedRlEnv
+
+_DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
+
+
+@checked_when_built(check_single)
+def staged_position_reward(
+    env: ManagerBasedRlEnv,
+    command_name: str,
+    object_name: str,
+    reaching_std: float,
+    bringing_std: float,
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+) -> torch.Tensor:
+    """Reward reaching the object, and then bringing it to its goal.
+
+    `exp(-e^2 / reaching_std^2) (1 + exp(-g^2 / bringing_std^2))`, where e is the distance from the
+    end effector to the object and g that from the object to the goal, in metres.
+    """
+    target: Entity = env.scene[object_name]
+    goal = lifting_command(env, command_name).target_pos
+    hand = site_pos(env, asset_cfg)
+    return _staged(hand, target.data.root_link_pos_w, goal, reaching_std, bringing_std)
+
+
+@checked_when_built(check_single)
+def bring_object_reward(
+    env: ManagerBasedRlEnv, command_name: str, object_name: str, std: float
+) -> torch.Tensor:
+    """Reward an object at its goal: `exp(-g^2 / std^2)`, with g the distance between them (m)."""
+    target: Entity = env.scene[object_name]
+    goal = lifting_command(env, command_name).target_pos
+    return _closeness(target.data.root_link_pos_w, goal, std)
+
+
+@checked_when_built(check_multi)
+def multi_cube_staged_position_reward(
+    env: ManagerBasedRlEnv,
+    command_name: str,
+    reaching_std: float,
+    bringing_std: float,
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+) -> torch.Tensor:
+    """Reward reaching the wanted object and bringing it to its goal; see `staged_position_reward`."""
+    command = multi_cube_command(env, command_name)
+    hand = site_pos(env, asset_cfg)
+    wanted = command.target_object_pos()
+    return _staged(hand, wanted, command.target_pos, reaching_std, bringing_std)
+
+
+@checked_when_built(check_multi)
+def multi_cube_bring_object_reward(
+    env: ManagerBasedRlEnv, command_name: str, std: float
+) -> torch.Tensor:
+    """Reward the wanted object at its goal; see `bring_object_reward`."""
+    command = multi_cube_command(env, command_name)
+    return _closeness(command.target_object_pos(), command.target_pos, std)
+
+
+def joint_velocity_hinge_penalty(
+    env: ManagerBasedRlEnv, max_vel: float, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
+) -> torch.Tensor:
+    """Penalize joints faster than `max_vel`: the sum of `max(|v| - max_vel, 0)^2`.
+
+    Velocities are in rad/s, or in m/s where joints slide. The value is positive, so that the weight
+    has to be negative.
+    """
+    asset: Entity = env.scene[asset_cfg.name]
+    speed = asset.data.joint_vel[:, columns(asset_cfg.joint_ids, env.device)].abs()
+    return speed.sub_(max_vel).clamp_(min=0.0).square_().sum(dim=1)
+
+
+def _staged(
+    hand: torch.Tensor,
+    target: torch.Tensor,
+    goal: torch.Tensor,
+    reaching_std: float,
+    bringing_std: float,
+) -> torch.Tensor:
+    reaching = _closeness(hand, target, reaching_std)
+    return reaching * (1.0 + _closeness(target, goal, bringing_std))
+
+
+def _closeness(one: torch.Tensor, other: torch.Tensor, std: float) -> torch.Tensor:
+    return torch.exp((one - other).square().sum(dim=1) / -(std**2))

@@ -1,0 +1,5 @@
+"""Training of the manipulation tasks."""
+
+from mjlab.tasks.manipulation.rl.runner import (
+    ManipulationOnPolicyRunner as ManipulationOnPolicyRunner,
+)

@@ -1,0 +1,76 @@
+"""How far an arm reaches, and goals that are beyond."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+from lifting_tasks import LIFT, MULTI
+
+from mjlab.asset_zoo.robots import get_yam_robot_cfg
+from mjlab.tasks.manipulation.mdp.reach import reach
+
+
+@pytest.fixture(scope="module")
+def arm() -> mujoco.MjModel:
+    return get_yam_robot_cfg().build().compile()
+
+
+def test_no_pose_of_the_joints_reaches_further(arm):
+    center, longest = reach(arm, "grasp_site")
+    data = mujoco.MjData(arm)
+    generator = np.random.default_rng(0)
+    low, high = arm.jnt_range.T
+    farthest = 0.0
+    for _ in range(2000):
+        data.qpos[:] = generator.uniform(low, high)
+        mujoco.mj_kinematics(arm, data)
+        farthest = max(farthest, math.dist(data.site("grasp_site").xpos, center))
+    # The bound holds, and is no more than a quarter above what random poses come to.
+    assert farthest <= longest < 1.25 * farthest
+
+
+def test_the_reach_of_a_plain_arm_is_the_length_of_its_links_and_slides():
+    model = mujoco.MjModel.from_xml_string("""
+      <mujoco><worldbody><body pos="0 0 1"><joint type="hinge" axis="0 0 1"/><geom size="0.1"/>
+        <body pos="0.5 0 0"><joint type="hinge" axis="0 1 0"/><geom size="0.1"/>
+          <body pos="0 0 0.2"><joint type="slide" axis="0 0 1" range="-0.1 0.3"/><geom size="0.1"/>
+            <site name="hand" pos="0 0.3 0.2"/></body></body></body></worldbody></mujoco>
+    """)
+    center, longest = reach(model, "hand")
+    assert center.tolist() == [0.0, 0.0, 1.0]
+    assert longest == pytest.approx(0.5 + math.hypot(0.3, 0.4) + 0.3)
+
+
+@pytest.mark.parametrize(
+    "joint", ["<freejoint/>", '<joint type="slide"/>'], ids=["floating", "endless slide"]
+)
+def test_what_can_go_anywhere_has_no_reach(joint):
+    model = mujoco.MjModel.from_xml_string(f"""
+      <mujoco><worldbody><body>{joint}<geom size="0.1"/><site name="hand"/></body></worldbody>
+      </mujoco>
+    """)
+    assert reach(model, "hand") is None
+
+
+@pytest.mark.parametrize("task", [LIFT, MULTI])
+@pytest.mark.parametrize("what", ["target_position_range", "object_pose_range"])
+def test_what_is_beyond_the_reach_is_refused_when_the_environment_is_built(make_env, task, what):
+    def edit(cfg):
+        command = cfg.commands["lift_height"]
+        command.object_pose_range = command.object_pose_range or type(command).ObjectPoseRangeCfg()
+        getattr(command, what).x = (0.3, 1.2)
+
+    thing = "goals" if what.startswith("target") else "objects"
+    with pytest.raises(ValueError, match=f"(?s)'lift'.*puts {thing} as far away as .1.2,.*{what}"):
+        make_env(task, edit=edit, images=False)
+
+
+def test_a_fixed_goal_is_in_reach_whatever_the_range_of_others(make_env):
+    def edit(cfg):
+        cfg.commands["lift_height"].difficulty = "fixed"
+        cfg.commands["lift_height"].target_position_range.x = (5.0, 6.0)
+
+    make_env(edit=edit)
