@@ -1,20 +1,27 @@
 """Draw the pictures of the documentation: `python docs/make_pictures.py`.
 
-It renders offscreen and needs no display. Run it again when a terrain preset changes.
+It renders offscreen and needs no display. Run it again when a terrain preset or the example of
+`variants.md` changes.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
-from mjlab.terrains import SubTerrainCfg, TerrainGenerator, TerrainGeneratorCfg
+from mjlab.scene import Scene, SceneCfg
+from mjlab.sim import Simulation, SimulationCfg
+from mjlab.terrains import SubTerrainCfg, TerrainEntityCfg, TerrainGenerator, TerrainGeneratorCfg
 from mjlab.terrains.config import ALL_TERRAIN_PRESETS
 from mjlab.viewer.gl_context import open_renderer
+from mjlab.viewer.offscreen_renderer import OffscreenRenderer
+from mjlab.viewer.viewer_config import ViewerConfig
 
 _IMAGES = Path(__file__).parent / "images"
 
@@ -29,6 +36,37 @@ _WIDTH, _HEIGHT, _TITLE, _OVERSAMPLING = 640, 168, 22, 2
 def main() -> None:
     """Draw all pictures."""
     draw_terrains(_IMAGES / "terrains.png")
+    draw_variants(_IMAGES / "variants.png")
+
+
+def draw_variants(path: Path) -> None:
+    """Draw the example of `variants.md` as it stands there, a while after it was dropped."""
+    page = (Path(__file__).parent / "variants.md").read_text(encoding="utf-8")
+    example: dict[str, Any] = {}
+    exec(page.split("```python\n")[1].split("```")[0], example)
+    plane = TerrainEntityCfg(terrain_type="plane")
+    entities = {"object": example["object_cfg"]}
+    scene = Scene(SceneCfg(12, env_spacing=0.3, terrain=plane, entities=entities), device="cpu")
+    sim = Simulation(
+        scene.num_envs,
+        SimulationCfg(engine="native"),
+        spec=scene.spec,
+        variant_info=scene.collect_variant_info(),
+        device="cpu",
+    )
+    scene.initialize(sim.mj_model, sim.model, sim.data)
+    sim.data.qpos[:, :3] = scene.env_origins + torch.tensor([0.0, 0.0, 0.1])
+    sim.step(500)
+    cfg = ViewerConfig(
+        width=720, height=300, max_extra_envs=11, origin_type=ViewerConfig.OriginType.WORLD,
+        distance=0.95, elevation=-35.0, azimuth=90.0, lookat=(0.0, 0.0, 0.05),
+    )  # fmt: skip
+    renderer = OffscreenRenderer(sim.mj_model, cfg, scene)
+    renderer.initialize()
+    renderer.update(sim)
+    Image.fromarray(renderer.render()).save(path, optimize=True)
+    renderer.close()
+    print(f"{path}: {path.stat().st_size // 1024} kB")
 
 
 def draw_terrains(path: Path) -> None:

@@ -75,12 +75,16 @@ _NAMES: dict[str, dict[str, str]] = {
     "mjlab.actuator": {**_XML_ACTUATORS, **_DELAYED_ACTUATORS},
     "mjlab.actuator.xml_actuator": _XML_ACTUATORS,
     "mjlab.actuator.delayed_actuator": _DELAYED_ACTUATORS,
+    "mjlab.asset_zoo.robots.i2rt_yam.yam_constants": _ROBOT_FILES,
     "mjlab.asset_zoo.robots.unitree_g1.g1_constants": _ROBOT_FILES,
     "mjlab.asset_zoo.robots.unitree_go1.go1_constants": _ROBOT_FILES,
     "mjlab.envs.mdp": _EVENTS,
     "mjlab.envs.mdp.events": _EVENTS,
     "mjlab.envs.mdp.dr": {"sync_actuator_delays": _EVENTS["sync_actuator_delays"]},
     "mjlab.envs.mdp.dr.actuator": {"sync_actuator_delays": _EVENTS["sync_actuator_delays"]},
+    "mjlab.tasks.manipulation.mdp": {**_EVENTS, **_REWARD_WEIGHT},
+    "mjlab.tasks.manipulation.mdp.curriculums": _REWARD_WEIGHT,
+    "mjlab.tasks.tracking.mdp": _EVENTS,
     "mjlab.tasks.velocity.mdp": {**_EVENTS, **_REWARD_WEIGHT, **_FLAT_ORIENTATION},
     "mjlab.tasks.velocity.mdp.curriculums": _REWARD_WEIGHT,
     "mjlab.tasks.velocity.mdp.rewards": _FLAT_ORIENTATION,
@@ -114,7 +118,13 @@ def _set_stochastic(value: Any, fields: dict[str, Any]) -> None:
     )
 
 
+def _scale_deltas(value: Any, fields: dict[str, Any]) -> None:
+    for name in ("delta_pos_scale", "delta_ori_scale"):
+        fields[name] = value * fields.get(name, 1.0)
+
+
 _DROPPED_FIELDS: dict[str, dict[str, tuple[str, _Translation | None]]] = {
+    "DifferentialIKActionCfg": {"scale": ("delta_pos_scale and delta_ori_scale", _scale_deltas)},
     "EventTermCfg": {
         "domain_randomization": ("nothing: fields are expanded as the function declares", None)
     },

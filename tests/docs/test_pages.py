@@ -19,7 +19,8 @@ _COMMAND = re.compile(r"\buv run (?:--\S+ )*([\w-]+)")
 _FLAG = re.compile(r"(?<![\w-])--([a-z][\w.-]*[a-z])")
 _OBJECT = re.compile(r"^\.\. auto\w+:: (\S+)$", re.MULTILINE)
 _COMMAND_LINE = re.compile(
-    r"\b(train-seeds|train|demo|play|evaluate|profile-env|visualize_terrain)((?: [^\s`#]+)*)"
+    r"\b(train-seeds|train|demo|play|evaluate|profile-env|export-scene|viz-nan|visualize_terrain)"
+    r"((?: [^\s`#]+)*)"
 )
 _MAKE = re.compile(r"\bmake ([a-z-]+)")
 
@@ -53,10 +54,12 @@ def test_make_targets_exist(page: Path) -> None:
 def _flags_of() -> dict[str, list[object]]:
     """Each command's flags: configs, whose fields they are, and sets of names."""
     from mjlab.scripts.evaluate import EvaluateConfig
+    from mjlab.scripts.export_scene import ExportSceneConfig
     from mjlab.scripts.play import PlayConfig
     from mjlab.scripts.profile_env import ProfileConfig
     from mjlab.scripts.train import TrainConfig
     from mjlab.scripts.visualize_terrain import VisualizeTerrainConfig
+    from mjlab.scripts.viz_nan import VizNanConfig
 
     train = TrainConfig.from_task("Mjlab-Cartpole-Swingup")
     play = PlayConfig(env=train.env)
@@ -67,7 +70,9 @@ def _flags_of() -> dict[str, list[object]]:
         "play": [play],
         "evaluate": [EvaluateConfig(env=train.env)],
         "profile-env": [ProfileConfig(env=train.env)],
+        "export-scene": [ExportSceneConfig()],
         "visualize_terrain": [VisualizeTerrainConfig()],
+        "viz-nan": [VizNanConfig()],
     }
 
 

@@ -128,7 +128,7 @@ def test_an_environment_with_other_observations_or_actions_is_refused(
     )
     monkeypatch.setattr(
         "mjlab.rl.onnx_policy.get_base_metadata",
-        lambda env, run: {
+        lambda env, run, groups: {
             "observation_names": ["speed", "height"],
             "step_dt": 0.02,
             "action_scale": 0.25,

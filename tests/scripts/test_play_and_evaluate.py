@@ -6,6 +6,7 @@ import json
 import shutil
 
 import pytest
+from commands import SMALL
 
 from mjlab.scripts.cli import parse_flags
 from mjlab.scripts.evaluate import EvaluateConfig
@@ -129,6 +130,76 @@ def test_evaluation_prints_a_table_for_people(run, trained):
     assert outcome.status == 0, outcome.err
     for part in ("Mean return", "95 % interval", "Success      0.0%", "at least 900", "native"):
         assert part in outcome.out
+
+
+def leans_right(env):
+    """Return whether the cart stands right of the middle, (num_envs,) bool."""
+    return env.sim.data.qpos[:, 0] > 0.0
+
+
+def test_success_that_the_task_defines_is_told_with_its_definition(run, with_images):
+    argv = (*SHORT, "--agent", "random", "--num-episodes", "64")
+    figures = json.loads(run("evaluate", with_images, *argv, "--json").out)
+    low, high = figures["success_interval"]
+    assert low < figures["success_rate"] < high
+    definition = "the cart stands right of the middle (leans_right), one step before the end"
+    assert figures["success_definition"] == definition
+    table = run("evaluate", with_images, *argv).out
+    assert f"Success      {figures['success_rate']:.1%}" in table
+    assert f"({definition})" in table
+
+
+def pixels(env):
+    return env.sim.data.qpos[:, :1, None, None].expand(-1, 2, 8, 8).clone()
+
+
+@pytest.fixture(scope="module")
+def with_images():
+    """A task whose policy sees images of 2 x 8 x 8, and which says what success is."""
+    from mjlab.managers import ObservationGroupCfg, ObservationTermCfg
+    from mjlab.tasks import registry
+
+    def env_cfg(play: bool = False):
+        cfg = registry.load_env_cfg(TASK, play=play)
+        term = ObservationTermCfg(func=pixels)
+        cfg.observations["camera"] = ObservationGroupCfg(terms={"pixels": term})
+        return cfg
+
+    def rl_cfg():
+        cfg = registry.load_rl_cfg(TASK)
+        cfg.experiment_name = "with_images"
+        cfg.obs_groups = {"actor": ("actor", "camera"), "critic": ("critic", "camera")}
+        for model in (cfg.actor, cfg.critic):
+            model.class_name = "mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel"
+            model.cnn_cfg = {"output_channels": [4], "kernel_size": [3], "padding": "zeros"}
+        cfg.evaluation.success_func = leans_right
+        return cfg
+
+    registry.register_mjlab_task("Test-With-Images", env_cfg, rl_cfg=rl_cfg)
+    yield "Test-With-Images"
+    del registry._tasks["Test-With-Images"]
+
+
+def test_a_policy_that_sees_images_trains_plays_and_is_scored(run, with_images, tmp_path):
+    logs = ("--log-root", str(tmp_path))
+    outcome = run("train", with_images, *SMALL, *logs, "--agent.max-iterations", "1")
+    assert outcome.status == 0, outcome.err
+    (run_dir,) = (tmp_path / "with_images").iterdir()
+    scores = []
+    for name in ("model_0.pt", f"{run_dir.name}.onnx"):
+        given = ("--checkpoint-file", str(run_dir / name))
+        scored = run("evaluate", with_images, *SHORT, *given, "--json")
+        assert scored.status == 0, scored.err
+        scores.append(json.loads(scored.out)["mean_return"])
+        played = run("play", with_images, *HEADLESS, *given)
+        assert played.status == 0, played.err
+    assert scores[0] == pytest.approx(scores[1], rel=1e-4)
+    wrong = run(
+        "train", with_images, *SMALL, *logs, "--agent.actor.class-name", "MLPModel",
+        "--agent.run-name", "wrong",
+    )  # fmt: skip
+    assert wrong.status == 1
+    assert "takes flat observations only" in wrong.message
 
 
 def test_the_same_seed_gives_the_same_figures_and_another_does_not(run):

@@ -27,6 +27,13 @@ def test_sizes_of_the_run_replace_those_of_the_task(tmp_path):
     assert cfg["critic"] == agent_cfg_of_task()["critic"]
 
 
+def test_encoders_of_the_run_replace_those_of_the_task(tmp_path):
+    encoder = {"camera": {"output_channels": [4, 8], "padding": "zeros", "max_pool": False}}
+    cfg = agent_cfg_beside(tmp_path, {"critic": {"cnn_cfg": encoder}})
+    assert cfg["critic"]["cnn_cfg"] == encoder
+    assert cfg["actor"] == agent_cfg_of_task()["actor"]
+
+
 def agent_cfg_of_task():
     from dataclasses import asdict
 
@@ -39,6 +46,8 @@ def agent_cfg_of_task():
         {"class_name": "pydoc:pipepager"},
         {"distribution_cfg": {"class_name": "pydoc:pipepager", "cmd": "touch pwned"}},
         {"cnn_cfg": {"class_name": "os:system"}},
+        {"cnn_cfg": {"activation": {"deep": ["os:system"]}}},
+        {"cnn_cfg": "os:system"},
         {"hidden_dims": "nonsense"},
         {"hidden_dims": [64, -1]},
         {"activation": "os:system"},

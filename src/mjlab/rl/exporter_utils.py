@@ -7,7 +7,8 @@ first, in its order and layout; numbers have full precision, and more keys follo
 | --- | --- |
 | action_names, action_types, action_entities, action_dims | per action term |
 | action_target_names, action_offset, action_clip | per component of the action vector |
-| observation_group | the group that the policy reads |
+| observation_group | the group that the policy reads; several make up `obs` in this order |
+| image_groups | the groups of images, each an input of its own; left out where there are none |
 | observation_dims | size of each of its terms, history included |
 | observation_delay | lowest and highest lag of each term, in steps |
 | step_dt, physics_dt, decimation | control period (s), physics time step (s), their ratio |
@@ -20,7 +21,7 @@ from __future__ import annotations
 import logging
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,12 +106,16 @@ def write_atomically(path: Path, content: bytes) -> None:
         raise
 
 
-def get_base_metadata(env: ManagerBasedRlEnv, run_path: str) -> Metadata:
+def get_base_metadata(
+    env: ManagerBasedRlEnv, run_path: str, observation_groups: Sequence[str] | None = None
+) -> Metadata:
     """Return what a deployment needs to run a policy of `env`, whatever the task has.
 
     Args:
         env: The environment; environment 0 stands for all.
         run_path: Name of the run, or "local".
+        observation_groups: Groups that make up the policy's flat observation, in order; None takes
+            "actor", or the first one.
 
     Joint keys are those of the entity that the actions drive: the one called "robot" if it is
     among them, else that of the first action term.
@@ -120,7 +125,7 @@ def get_base_metadata(env: ManagerBasedRlEnv, run_path: str) -> Metadata:
     if entity is not None:
         metadata.update(_joint_metadata(env, entity))
     metadata["command_names"] = list(env.command_manager.active_terms)
-    metadata.update(_observation_metadata(env))
+    metadata.update(_observation_metadata(env, observation_groups))
     metadata.update(_action_metadata(env))
     metadata["step_dt"] = _shortest(env.step_dt)
     metadata["physics_dt"] = _shortest(env.physics_dt)
@@ -181,23 +186,25 @@ def _mujoco_gains(model: Any, element: int) -> tuple[float, float]:
     return float(0.0 - bias[1]), float(0.0 - bias[2])
 
 
-def _observation_metadata(env: ManagerBasedRlEnv) -> Metadata:
+def _observation_metadata(env: ManagerBasedRlEnv, groups: Sequence[str] | None) -> Metadata:
     manager = env.observation_manager
-    group = "actor" if "actor" in manager.active_terms else next(iter(manager.active_terms), None)
-    if group is None:
+    if groups is None:
+        groups = ["actor"] if "actor" in manager.active_terms else list(manager.active_terms)[:1]
+    if not groups:
         return {}
-    names = manager.active_terms[group]
-    cfgs = [manager.get_term_cfg(group, name) for name in names]
+    terms = [(group, name) for group in groups for name in manager.active_terms[group]]
+    cfgs = [manager.get_term_cfg(group, name) for group, name in terms]
+    dims = [dim for group in groups for dim in manager.group_obs_term_dim[group]]
     return {
-        "observation_names": list(names),
+        "observation_names": [name for _, name in terms],
         "observation_terms_scale": [_scale(cfg.scale) for cfg in cfgs],
         "observation_terms_flatten_history_dim": [cfg.flatten_history_dim for cfg in cfgs],
         "observation_terms_history_length": [cfg.history_length for cfg in cfgs],
         "observation_terms_clip": [
             list(cfg.clip) if cfg.clip is not None else [-np.inf, np.inf] for cfg in cfgs
         ],
-        "observation_group": group,
-        "observation_dims": [int(np.prod(dim)) for dim in manager.group_obs_term_dim[group]],
+        "observation_group": ",".join(groups),
+        "observation_dims": [int(np.prod(dim)) for dim in dims],
         "observation_delay": [[cfg.delay_min_lag, cfg.delay_max_lag] for cfg in cfgs],
     }
 

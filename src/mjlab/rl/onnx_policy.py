@@ -1,28 +1,32 @@
 """Playing an exported policy: the graph of the ONNX file, computed by torch.
 
 So no ONNX runtime has to be installed, and one file plays in any number of environments, although
-it is exported for one. It covers networks of fully connected layers. Recurrent and convolutional
-ones are refused; their checkpoints can be played.
+it is exported for one. It covers networks of fully connected layers and of image encoders.
+Recurrent ones are refused; their checkpoints can be played.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch.nn import functional
 
 from mjlab.rl.checkpoint import CheckpointError
 from mjlab.rl.exporter_utils import get_base_metadata, metadata_texts
+from mjlab.rl.onnx_operators import (
+    OPERATORS,
+    ROW_WISE,
+    Operator,
+    attribute_value,
+    identity,
+    tensor_value,
+)
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
-
-_Operator = Callable[..., torch.Tensor]
 
 # What has to be the same where a policy was trained and where it is played. Numbers are compared
 # with a tolerance, because mjlab 1.6 writes three decimals.
@@ -49,10 +53,15 @@ class OnnxPolicyError(CheckpointError):
 class _Step:
     """One node of the graph."""
 
-    operator: _Operator
+    operator: Operator
     inputs: tuple[str, ...]
     output: str
     attributes: dict[str, Any]
+
+    def compute(self, values: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Return the output, from the values of the graph by name."""
+        inputs = [values[name] if name else None for name in self.inputs]
+        return self.operator(*inputs, **self.attributes)
 
 
 class OnnxPolicy(torch.nn.Module):
@@ -62,8 +71,9 @@ class OnnxPolicy(torch.nn.Module):
 
     Attributes:
         metadata: What the file says about itself; see `mjlab.rl.exporter_utils`.
-        num_observations: Size of the observation of one environment.
+        num_observations: Size of the flat observation of one environment; 0 if it sees images only.
         num_actions: Size of the action of one environment.
+        image_shapes: For each group of images that it sees, (channels, height, width).
     """
 
     def __init__(self, path: str | Path, device: str = "cpu") -> None:
@@ -74,8 +84,9 @@ class OnnxPolicy(torch.nn.Module):
             device: Torch device to compute on.
 
         Raises:
-            OnnxPolicyError: the file is missing, no ONNX file, or has other than one input and one
-                output, or an operator that is not known here.
+            OnnxPolicyError: the file is missing, no ONNX file, has other inputs than a flat
+                observation and images, has more than one output, or an operator that is not known
+                here.
         """
         super().__init__()
         self.path = Path(path)
@@ -83,19 +94,18 @@ class OnnxPolicy(torch.nn.Module):
         self.metadata: dict[str, str] = {item.key: item.value for item in model.metadata_props}
         self._constants = torch.nn.ParameterDict()
         self._names: dict[str, str] = {}
+        # Sizes and axes, which stay on the CPU, where they are looked at.
+        self._integers: dict[str, torch.Tensor] = {}
         for initializer in model.graph.initializer:
-            self._add_constant(initializer.name, initializer)
-        inputs = [item for item in model.graph.input if item.name not in self._names]
-        if len(inputs) != 1 or len(model.graph.output) != 1:
-            raise OnnxPolicyError(
-                f"The policy {self.path} has the inputs {[item.name for item in inputs]} and the "
-                f"outputs {[item.name for item in model.graph.output]}; one of each can be played "
-                "here. Play the checkpoint (model_<iteration>.pt) instead."
-            )
-        self._input, self._output = inputs[0].name, model.graph.output[0].name
-        self.num_observations = _last_dim(inputs[0])
-        self.num_actions = _last_dim(model.graph.output[0])
+            self._add_constant(initializer.name, tensor_value(initializer))
+        self._state, self.num_observations, self.image_shapes = self._read_inputs(model.graph)
+        self._output = model.graph.output[0].name
+        self.num_actions = _dims(model.graph.output[0])[-1]
         self._steps = [self._read(node) for node in model.graph.node]
+        kinds = {node.op_type for node in model.graph.node}
+        self._is_row_wise = not self.image_shapes and kinds <= set(ROW_WISE)
+        if not self._is_row_wise:
+            self._compute_sizes()
         self.requires_grad_(False)
         self.to(device)
 
@@ -103,18 +113,18 @@ class OnnxPolicy(torch.nn.Module):
         """Return actions (N, num_actions).
 
         Args:
-            observations: The environment's groups of observations, of which the one that the
-                policy was trained with is taken; or a tensor (N, num_observations).
+            observations: The environment's groups of observations, of which those that the policy
+                was trained with are taken; or, for a policy without images, a tensor
+                (N, num_observations).
         """
-        if not isinstance(observations, torch.Tensor):
-            observations = observations[self.metadata.get("observation_group", "actor")]
-        values = {self._input: observations}
-        for name, key in self._names.items():
-            values[name] = self._constants[key]
-        for step in self._steps:
-            inputs = [values[name] if name else None for name in step.inputs]
-            values[step.output] = step.operator(*inputs, **step.attributes)
-        return values[self._output]
+        inputs = {name: observations[name] for name in self.image_shapes}
+        if self._state is not None:
+            inputs[self._state] = self._flat(observations)
+        if self._is_row_wise:
+            return self._run(inputs)
+        # The graph is that of one environment, and so it stays: torch adds the batch around it.
+        alone = {name: value.unsqueeze(1) for name, value in inputs.items()}
+        return torch.vmap(self._run)(alone).squeeze(1)
 
     def check_fits(self, env: ManagerBasedRlEnv) -> None:
         """Refuse an environment with other observations or actions than those of the training.
@@ -122,12 +132,14 @@ class OnnxPolicy(torch.nn.Module):
         Raises:
             OnnxPolicyError: something differs; the text names all of it.
         """
-        wanted = metadata_texts(get_base_metadata(env, ""))
-        differences = [
-            f"{key}: the policy has {self.metadata[key]}, the environment {wanted[key]}"
-            for key in _INTERFACE
-            if key in self.metadata and not _alike(self.metadata[key], wanted.get(key, ""))
-        ]
+        differences = self._group_differences(env)
+        if not differences:
+            wanted = metadata_texts(get_base_metadata(env, "", self._named_groups()))
+            differences = [
+                f"{key}: the policy has {self.metadata[key]}, the environment {wanted[key]}"
+                for key in _INTERFACE
+                if key in self.metadata and not _alike(self.metadata[key], wanted.get(key, ""))
+            ]
         sizes = env.action_manager.total_action_dim
         if sizes != self.num_actions:
             differences.append(f"actions: the policy has {self.num_actions}, not {sizes}")
@@ -138,28 +150,101 @@ class OnnxPolicy(torch.nn.Module):
                 + "."
             )
 
-    def _add_constant(self, name: str, value: Any) -> None:
-        from onnx import numpy_helper
+    def _group_differences(self, env: ManagerBasedRlEnv) -> list[str]:
+        """Return, one text each, the groups of observations that the environment has not."""
+        groups = self._named_groups() or []
+        if not groups and not self.image_shapes:
+            return []
+        shapes: dict[str, Any] = env.observation_manager.group_obs_dim
+        differences = [
+            f"observations {name!r}: the environment has no such group"
+            for name in groups
+            if name not in shapes
+        ]
+        for name, shape in self.image_shapes.items():
+            found = tuple(shapes[name]) if name in shapes else "no such group"
+            if found != shape:
+                differences.append(
+                    f"images {name!r}: the policy has {shape}, the environment {found}"
+                )
+        return differences
 
-        tensor = torch.from_numpy(numpy_helper.to_array(value).copy())
+    def _named_groups(self) -> list[str] | None:
+        """Return the groups that make up the flat observation, in order, if the file says so."""
+        if self._state is None:
+            return []
+        names = self.metadata.get("observation_group")
+        return None if names is None else names.split(",")
+
+    def _flat(self, observations: Any) -> torch.Tensor:
+        if isinstance(observations, torch.Tensor):
+            return observations
+        groups = self._named_groups() or ["actor"]
+        return torch.cat([observations[name] for name in groups], dim=-1)
+
+    def _run(self, inputs: dict[str, torch.Tensor]) -> torch.Tensor:
+        values = {**inputs, **self._integers}
+        for name, key in self._names.items():
+            values[name] = self._constants[key]
+        for step in self._steps:
+            values[step.output] = step.compute(values)
+        return values[self._output]
+
+    def _compute_sizes(self) -> None:
+        """Compute the whole numbers in the graph, which depend on shapes and not on values."""
+        values: dict[str, torch.Tensor] = dict(self._integers)
+        for name, key in self._names.items():
+            values[name] = self._constants[key]
+        for name, shape in self.image_shapes.items():
+            values[name] = torch.zeros(1, *shape)
+        if self._state is not None:
+            values[self._state] = torch.zeros(1, self.num_observations)
+        remaining = []
+        for step in self._steps:
+            value = values[step.output] = step.compute(values)
+            if value.is_floating_point():
+                remaining.append(step)
+            else:
+                self._integers[step.output] = value
+        self._steps = remaining
+
+    def _read_inputs(self, graph: Any) -> tuple[str | None, int, dict[str, tuple[int, ...]]]:
+        """Return the name and size of the flat input, and the shapes of images by name."""
+        known = {*self._names, *self._integers}
+        dims = {item.name: _dims(item) for item in graph.input if item.name not in known}
+        flat = [name for name, size in dims.items() if len(size) == 2]
+        images = {name: tuple(size[1:]) for name, size in dims.items() if len(size) == 4}
+        understood = len(flat) <= 1 and len(flat) + len(images) == len(dims) > 0
+        if not understood or len(graph.output) != 1:
+            raise OnnxPolicyError(
+                f"The policy {self.path} has the inputs {list(dims)} of sizes "
+                f"{list(dims.values())} and the outputs {[item.name for item in graph.output]}; "
+                "one flat input, any number of images and one output can be played here. Play "
+                "the checkpoint (model_<iteration>.pt) instead."
+            )
+        state = flat[0] if flat else None
+        return state, 0 if state is None else dims[state][-1], images
+
+    def _add_constant(self, name: str, tensor: torch.Tensor) -> None:
+        if not tensor.is_floating_point():
+            self._integers[name] = tensor
+            return
         # Names of an ONNX graph hold dots and slashes, which torch forbids.
         self._names[name] = key = f"c{len(self._names)}"
         self._constants[key] = torch.nn.Parameter(tensor, requires_grad=False)
 
     def _read(self, node: Any) -> _Step:
-        from onnx import helper
-
-        attributes = {item.name: helper.get_attribute_value(item) for item in node.attribute}
+        attributes = {item.name: attribute_value(item) for item in node.attribute}
         if node.op_type == "Constant":
             self._add_constant(node.output[0], attributes["value"])
-            return _Step(_identity, (node.output[0],), node.output[0], {})
-        if node.op_type not in _OPERATORS:
+            return _Step(identity, (node.output[0],), node.output[0], {})
+        if node.op_type not in OPERATORS:
             raise OnnxPolicyError(
                 f"The policy {self.path} uses the operator {node.op_type}, which is not known "
-                f"here; known are {sorted(_OPERATORS)}. Play the checkpoint "
+                f"here; known are {sorted(OPERATORS)}. Play the checkpoint "
                 "(model_<iteration>.pt) instead."
             )
-        return _Step(_OPERATORS[node.op_type], tuple(node.input), node.output[0], attributes)
+        return _Step(OPERATORS[node.op_type], tuple(node.input), node.output[0], attributes)
 
 
 def load_onnx_policy(path: Path, env: Any, device: str) -> OnnxPolicy:
@@ -188,8 +273,8 @@ def _load(path: Path) -> Any:
     return model
 
 
-def _last_dim(value: Any) -> int:
-    return int(value.type.tensor_type.shape.dim[-1].dim_value)
+def _dims(value: Any) -> list[int]:
+    return [int(dim.dim_value) for dim in value.type.tensor_type.shape.dim]
 
 
 def _alike(one: str, other: str) -> bool:
@@ -207,65 +292,3 @@ def _same(one: str, other: str) -> bool:
     except ValueError:
         return one == other
     return math.isclose(first, second, rel_tol=_RELATIVE_TOLERANCE, abs_tol=_ABSOLUTE_TOLERANCE)
-
-
-# Operators of ONNX, as far as fully connected networks use them: inputs in order, attributes by
-# name. https://onnx.ai/onnx/operators/
-
-
-def _gemm(
-    a: torch.Tensor,
-    b: torch.Tensor,
-    c: torch.Tensor | None = None,
-    alpha: float = 1.0,
-    beta: float = 1.0,
-    transA: int = 0,
-    transB: int = 0,
-) -> torch.Tensor:
-    product = alpha * ((a.mT if transA else a) @ (b.mT if transB else b))
-    return product if c is None else product + beta * c
-
-
-def _clip(
-    x: torch.Tensor, low: torch.Tensor | None = None, high: torch.Tensor | None = None
-) -> torch.Tensor:
-    return x if low is None and high is None else torch.clamp(x, low, high)
-
-
-def _identity(x: torch.Tensor) -> torch.Tensor:
-    return x
-
-
-def _leaky_relu(x: torch.Tensor, alpha: float = 0.01) -> torch.Tensor:
-    return functional.leaky_relu(x, alpha)
-
-
-def _selu(x: torch.Tensor, alpha: float = 1.67326319, gamma: float = 1.05070102) -> torch.Tensor:
-    return gamma * functional.elu(x, alpha)
-
-
-def _concat(*parts: torch.Tensor, axis: int) -> torch.Tensor:
-    return torch.cat(parts, dim=axis)
-
-
-_OPERATORS: Mapping[str, _Operator] = {
-    "Add": torch.add,
-    "Clip": _clip,
-    "Concat": _concat,
-    "Constant": _identity,
-    "Div": torch.div,
-    "Elu": functional.elu,
-    "Erf": torch.erf,
-    "Gemm": _gemm,
-    "Identity": _identity,
-    "LeakyRelu": _leaky_relu,
-    "MatMul": torch.matmul,
-    "Mul": torch.mul,
-    "Neg": torch.neg,
-    "Relu": torch.relu,
-    "Selu": _selu,
-    "Sigmoid": torch.sigmoid,
-    "Softplus": functional.softplus,
-    "Sub": torch.sub,
-    "Tanh": torch.tanh,
-}

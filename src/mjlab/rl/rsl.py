@@ -121,8 +121,10 @@ os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
 with _import_context:
     from rsl_rl.env import VecEnv as VecEnv
     from rsl_rl.models import CNNModel as CNNModel
+    from rsl_rl.models import MLPModel as MLPModel
     from rsl_rl.modules import CNN as CNN
     from rsl_rl.runners import OnPolicyRunner as OnPolicyRunner
     from rsl_rl.utils import check_nan as check_nan
+    from rsl_rl.utils import resolve_callable as resolve_callable
     from rsl_rl.utils.logger import Logger as Logger
     from tensordict import TensorDict as TensorDict

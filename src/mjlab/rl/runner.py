@@ -25,7 +25,13 @@ from mjlab.rl.distributed import join_processes
 from mjlab.rl.evaluate import reward_unit
 from mjlab.rl.evaluation_result import EvaluationResult
 from mjlab.rl.exporter_utils import attach_metadata_to_onnx, get_base_metadata
+from mjlab.rl.image_encoders import (
+    settle_image_settings,
+    shared_parameters_allowed,
+    train_once,
+)
 from mjlab.rl.migration import check_fits, check_optimizer_fits, migrate
+from mjlab.rl.network_checks import check_networks
 from mjlab.rl.onnx_export import export_to_onnx
 from mjlab.rl.progress import IterationStats, TrainingObserver
 from mjlab.rl.rsl import (
@@ -81,12 +87,19 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             train_cfg: A `RslRlOnPolicyRunnerCfg` as a dict; it is edited here and by rsl_rl.
             log_dir: Folder of the run. None: nothing is written.
             device: Device of the networks.
+
+        Raises:
+            ValueError: a network cannot take the observations that `obs_groups` gives it.
         """
         _drop_unused_keys(train_cfg)
+        observations = env.get_observations()
+        check_networks(observations, train_cfg)
+        settle_image_settings(observations, train_cfg)
         if train_cfg.get("torch_compile_mode"):
             enable_torch_compile()
-        with _printing_to_log():
+        with _printing_to_log(), shared_parameters_allowed():
             super().__init__(env, train_cfg, log_dir, device)
+        train_once(self.alg.optimizer)
         if not train_cfg.get("torch_compile_mode"):
             keep_compiler_out_of_step(self.alg.optimizer)
         self.logger: RunLogger = RunLogger(
@@ -428,8 +441,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     ) -> None:
         """Write the policy (normalizer, network, deterministic head) to `path`/`filename`.
 
-        Opset 18, batch size 1; input `obs`, output `actions` (recurrent and image models have
-        more inputs).
+        Opset 18, batch size 1; input `obs`, output `actions`. Image models have one input more for
+        each group of images, by its name; recurrent ones have their state.
         """
         model = self.alg.get_policy().as_onnx(verbose=verbose)
         export_to_onnx(model, Path(path) / filename, verbose)
@@ -467,7 +480,10 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         """Return the metadata that `export_policy` writes; task runners add to it."""
         folder = self.logger.log_dir
         run = Path(folder).resolve().name if folder is not None else "local"
-        return dict(get_base_metadata(self.env.unwrapped, run))
+        policy: Any = self.alg.get_policy()
+        images = list(getattr(policy, "obs_groups_2d", ()))
+        metadata = dict(get_base_metadata(self.env.unwrapped, run, list(policy.obs_groups)))
+        return {**metadata, "image_groups": images} if images else metadata
 
     # Helpers.
 

@@ -37,12 +37,17 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
     Episodes are those of the task's training config, whose time limit is part of the task.
     """
     from mjlab.rl.evaluate import evaluate_policy
+    from mjlab.rl.success import required_return, success_definition
 
     if cfg.num_episodes < 1:
         raise UserError(f"--num-episodes is {cfg.num_episodes}; at least 1 has to be played.")
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
-    env_cfg = env_cfg_of(task, cfg, play=False)
+    env_cfg = env_cfg_of(task, cfg, checkpoint, play=False)
+    solved = load_rl_cfg(task, profile=cfg.profile).evaluation
+    if solved.prepare_env is not None:
+        # Once more: what it does may depend on what the task has got for this policy.
+        solved.prepare_env(env_cfg)
     env = make_env(
         task,
         env_cfg,
@@ -52,8 +57,6 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
         seed=cfg.seed,
         profile=cfg.profile,
     )
-    solved = load_rl_cfg(task, profile=cfg.profile).evaluation
-    target = solved.solved_return if solved.success_return is None else solved.success_return
     try:
         policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
         result = evaluate_policy(
@@ -61,8 +64,9 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
             policy,
             cfg.num_episodes,
             max_steps=cfg.max_steps,
-            success_return=target,
+            success_return=required_return(solved),
             success_func=solved.success_func,
+            success_is_survival=solved.success_is_survival,
             metrics=solved.metrics,
             seed=cfg.seed,
         )
@@ -74,13 +78,14 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
         "policy": cfg.agent if checkpoint is None else str(checkpoint),
         "physics": physics,
         "seed": cfg.seed,
+        "success_definition": success_definition(solved),
         **result.to_dict(),
     }
-    print(json.dumps(figures, indent=2) if cfg.json else _table(figures, target))
+    print(json.dumps(figures, indent=2) if cfg.json else _table(figures))
     return figures
 
 
-def _table(figures: dict[str, Any], target: float | None) -> str:
+def _table(figures: dict[str, Any]) -> str:
     low, high = figures["return_interval"]
     lines = [
         f"Task         {figures['task']}",
@@ -93,10 +98,9 @@ def _table(figures: dict[str, Any], target: float | None) -> str:
     ]
     if figures["success_rate"] is not None:
         low, high = figures["success_interval"]
-        meaning = "" if target is None else f"   (return of at least {target:g})"
         lines.append(
             f"Success      {figures['success_rate']:.1%}   "
-            f"95 % interval [{low:.1%}, {high:.1%}]{meaning}"
+            f"95 % interval [{low:.1%}, {high:.1%}]   ({figures['success_definition']})"
         )
     if figures["failure_rate"] is not None:
         low, high = figures["failure_interval"]

@@ -22,6 +22,7 @@ from mjlab.scripts.resume import (
     profile_to_resume,
 )
 from mjlab.scripts.run_folder import NewRunFolder, SharedRunFolder, write_run_info
+from mjlab.scripts.task_options import options_of, prepare_env_cfg, with_task_options
 from mjlab.scripts.train_checks import check_flags
 from mjlab.scripts.training_device import training_device
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
@@ -95,7 +96,7 @@ def parse_train_flags(task: str, flags: list[str], prog: str) -> TrainConfig:
         UnknownProfileError: the task has no such profile.
     """
     return parse_with_profile(
-        lambda profile: TrainConfig.from_task(task, profile),
+        lambda profile: with_task_options(TrainConfig.from_task(task, profile), task),
         lambda cfg: profile_to_resume(task, cfg),
         flags,
         prog,
@@ -137,6 +138,8 @@ def _train(
         suggest_profile(task, cfg.profile, device)
     with _run_folder(cfg, rank, output) as folder:
         with same_fate():
+            fetched_from = None if checkpoint is None else cfg.wandb_run_path
+            prepare_env_cfg(task, cfg, cfg.env, checkpoint, fetched_from)
             env = _build_env(cfg, device, folder.path, rank)
         try:
             under = f", profile {cfg.profile}" if cfg.profile else ""
@@ -238,7 +241,8 @@ def _build_runner(
     # Seeded anew, so that the first networks depend on the seed alone and not on how many random
     # numbers the environment drew while it was built.
     seed_rng(cfg.agent.seed)
-    return runner_cls(env, asdict(cfg.agent), str(run_dir), device)
+    further = options_of(task, cfg).runner_kwargs()
+    return runner_cls(env, asdict(cfg.agent), str(run_dir), device, **further)
 
 
 class _Beginning(TrainingObserver):
@@ -295,10 +299,12 @@ def _leave_results(task: str, cfg: TrainConfig, run_dir: Path, device: str) -> N
         from mjlab.scripts.record import VideoCfg, record_policy
         from mjlab.viewer.errors import RenderingUnavailableError
 
+        env_cfg = policy_env_cfg(task, cfg.profile, play=True)
+        prepare_env_cfg(task, None, env_cfg, checkpoint)
         try:
             record_policy(
                 task,
-                policy_env_cfg(task, cfg.profile, play=True),
+                env_cfg,
                 checkpoint,
                 run_dir / "videos",
                 device,

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import torch
 
     from mjlab.sim.config import SimulationCfg
+    from mjlab.sim.rendering import CameraView, Images
 
 
 # Fields that MuJoCo stores as nine numbers in a row and that cross the seam as 3 x 3 matrices.
@@ -42,8 +43,8 @@ class Capabilities:
     """Physics threads, or None where the engine has no such notion."""
     raycast_problem: str | None = None
     """Why `Engine.raycast` does not work with this model, and what to do; None if it works."""
-    render: bool = False
-    """Whether `Engine.render` works."""
+    render_problem: str | None = None
+    """Why `Engine.render` does not work with this model, and what to do; None if it works."""
 
 
 class Engine(ABC):
@@ -91,6 +92,21 @@ class Engine(ABC):
     @abstractmethod
     def is_expanded(self, field: str) -> bool:
         """Return whether the model field is held per environment."""
+
+    @abstractmethod
+    def hide_geoms(self, absent: torch.Tensor) -> None:
+        """Keep geoms from touching anything in some environments, for good.
+
+        `geom_contype` and `geom_conaffinity` become fields that say so, and are not to be written.
+        Rays and images leave them out because they are fully transparent, which is up to the
+        caller; an explicit contact pair of such a geom still acts.
+
+        Args:
+            absent: (N, ngeom) bool.
+
+        Raises:
+            ValueError: an option in effect makes the engine unable to.
+        """
 
     @abstractmethod
     def constants_written_by(self, level: int) -> tuple[str, ...]:
@@ -146,10 +162,30 @@ class Engine(ABC):
         """
 
     @abstractmethod
+    def render(self, views: tuple[CameraView, ...]) -> list[Images]:
+        """Render what cameras of the model see, at the poses that derived fields have.
+
+        A ray through the centre of each pixel meets the nearest surface of a geom of the view's
+        groups, fully transparent or not: planes from above, height fields from above, and other
+        geoms from outside. Its colour is that of its geom or material, times the texture, times
+        the light that falls on it. Beyond the model's far limit (`vis.map.zfar`), and where there
+        is nothing, colours are those of the skybox, or black.
+
+        Args:
+            views: What to render. The same tuple as in an earlier call is served fastest.
+
+        Returns:
+            Images in the order of `views`. Their tensors may be overwritten by the next call.
+        """
+
+    @abstractmethod
     def jacobian(
         self, points: torch.Tensor, body_ids: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Jacobians of one world-frame point per environment, moving with a body.
+
+        They belong to the state that derived fields (`xpos`) belong to, and not to a qpos that was
+        written or stepped since.
 
         Args:
             points: (N, 3) metres. body_ids: (N,) int32.

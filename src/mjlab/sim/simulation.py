@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Callable
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -18,11 +19,14 @@ from mjlab.sim.engine import (
     create_engine,
     resolve_engine_name,
 )
+from mjlab.sim.engines.field_lists import COLLISION_MASKS
 from mjlab.sim.fields import FieldView, SharedField
+from mjlab.sim.variants import VariantInfo, VariantValues
 from mjlab.utils.nan_guard import NanGuard
 
 if TYPE_CHECKING:
     from mjlab.managers.event_manager import RecomputeLevel
+    from mjlab.sim.rendering import CameraView, Images
 
 logger = logging.getLogger(__name__)
 
@@ -49,21 +53,23 @@ class Simulation:
         device: str = "cuda:0",
         *,
         spec: mujoco.MjSpec | None = None,
-        variant_info: list[Any] | None = None,
+        variant_info: list[tuple[str, VariantInfo]] | None = None,
     ) -> None:
         """Compile (from `spec`) or take (`model`) a MuJoCo model and allocate `num_envs` copies.
 
+        `variant_info` has the name and the `variant_metadata` of each entity that is another thing
+        in each environment; the model has to be compiled from the spec that they are in.
+
         Raises:
             ValueError: `num_envs` below 1, neither or both of model and spec, unknown options, or
-                an XML that does not compile (MuJoCo's message is passed on).
+                an XML that does not compile (MuJoCo's message is passed on), or variants that
+                differ in what the engine cannot hold per environment.
             EngineUnavailableError: the chosen engine cannot run on `device`.
         """
         if num_envs < 1:
             raise ValueError(f"The number of environments is {num_envs}; it has to be at least 1.")
         if (model is None) == (spec is None):
             raise ValueError("Give Simulation exactly one of `model` and `spec`.")
-        if variant_info:
-            raise ValueError("Entities with variants per environment are not supported yet.")
         engine_name = resolve_engine_name(cfg.engine, device)
         self.num_envs = num_envs
         self.cfg = cfg
@@ -77,10 +83,13 @@ class Simulation:
         # randomization starts from are a snapshot.
         self._default_model = copy.copy(self._mj_model)
         self._default_fields: dict[str, torch.Tensor] = {}
+        self._variants: VariantValues | None = None
         self._engine = create_engine(engine_name, self._mj_model, num_envs, cfg, device)
         self._data = FieldView(self._engine.data_field, num_envs, "data")
         self._model = FieldView(self._lookup_model_field, num_envs, "model")
         self._expanded: set[str] = set()
+        if variant_info:
+            self._apply_variants(variant_info)
         self._forward_callbacks: list[Callable[[], None]] = []
         self._sensor_context: Any = None
         self.nan_guard = NanGuard(
@@ -150,13 +159,28 @@ class Simulation:
 
     @property
     def per_world_default_fields(self) -> set[str]:
-        """Fields whose compile-time value differs between environments (variants); none today."""
-        return set()
+        """Fields whose compile-time value differs between environments, because of variants."""
+        return set() if self._variants is None else set(self._variants.fields)
 
     @property
     def world_to_variant(self) -> dict[str, torch.Tensor]:
-        """Variant index of each environment, by entity; empty without variants."""
-        return {}
+        """Variant index of each environment, (N,) int64, by entity; empty without variants."""
+        if self._variants is None:
+            return {}
+        return {
+            name: torch.as_tensor(ids, dtype=torch.int64, device=self.device)
+            for name, ids in self._variants.world_to_variant.items()
+        }
+
+    @cached_property
+    def absent_geoms(self) -> torch.Tensor | None:
+        """(N, ngeom) bool: geoms that an environment's variants do not have; None if there are none.
+
+        Such a geom touches nothing and is not seen. Its fields must not be written.
+        """
+        if self._variants is None or not self._variants.absent_geoms.any():
+            return None
+        return torch.as_tensor(self._variants.absent_geoms, device=self.device)
 
     @property
     def default_model_fields(self) -> dict[str, torch.Tensor]:
@@ -165,6 +189,8 @@ class Simulation:
 
     def get_default_field(self, field: str) -> torch.Tensor:
         """Return the compile-time value of a model field, without environment dimension.
+
+        With it for `per_world_default_fields`: what the variants of each environment compile to.
 
         The baseline for randomization by scaling or adding, so that it never drifts. float32 where
         MuJoCo has doubles. Raises ValueError for a field that does not exist.
@@ -178,6 +204,9 @@ class Simulation:
         if not hasattr(source, field) and hasattr(source.opt, field):
             source = source.opt
         value = getattr(source, field, None)
+        if field in self.per_world_default_fields:
+            assert self._variants is not None
+            value = self._variants.get(field)
         if field.startswith("_") or value is None or callable(value):
             raise ValueError(
                 f"MjModel has no field {field!r}. Fields carry MuJoCo's names, such as "
@@ -198,6 +227,25 @@ class Simulation:
         except ValueError as error:
             raise AttributeError(str(error)) from error
         return SharedField.make(value, self.num_envs, name)
+
+    def _apply_variants(self, info: list[tuple[str, VariantInfo]]) -> None:
+        """Give every environment the model fields of its own variants."""
+        derived = self._engine.constants_written_by(3)
+        variants = VariantValues(self._default_model, self.num_envs, info, derived)
+        self._variants = variants
+        for name in variants.fields:
+            try:
+                self.expand_model_fields((name,))
+            except ValueError as error:
+                raise ValueError(variants.refusal(name, error)) from error
+        # The mean inertia, which is no field, scales the solver's tolerance.
+        self.recompute_constants(3)
+        for name in dict.fromkeys((*variants.fields, *derived)):
+            self._engine.model_field(name).copy_(self.get_default_field(name))
+        if self.absent_geoms is not None:
+            self._engine.hide_geoms(self.absent_geoms)
+            self._expanded.update(COLLISION_MASKS)
+        self._engine.forward(None)
 
     def expand_model_fields(self, fields: tuple[str, ...] | list[str]) -> None:
         """Give every environment its own copy of model fields, starting from the shared values.
@@ -256,18 +304,23 @@ class Simulation:
     def sense(self) -> None:
         """Evaluate camera and ray sensors at the current poses; nothing without such sensors."""
         if self._sensor_context is not None:
-            self._sensor_context.sense(self.raycast)
+            self._sensor_context.sense(self.raycast, self.render)
 
     def set_sensor_context(self, ctx: Any) -> None:
-        """Set the object whose `sense(raycast)` evaluates camera and ray sensors.
+        """Set the object whose `sense(raycast, render)` evaluates camera and ray sensors.
 
         Raises:
-            EngineUnavailableError: it has ray sensors, and the engine casts no rays in this model.
+            EngineUnavailableError: it has ray sensors, and the engine casts no rays in this model;
+                or it has cameras, and the engine does not render this model.
         """
-        problem = self.capabilities.raycast_problem
-        if ctx.has_raycasts and problem is not None:
-            raise EngineUnavailableError(problem)
+        for is_needed, problem in (
+            (ctx.has_raycasts, self.capabilities.raycast_problem),
+            (ctx.has_cameras, self.capabilities.render_problem),
+        ):
+            if is_needed and problem is not None:
+                raise EngineUnavailableError(problem)
         self._sensor_context = ctx
+        ctx.set_render_context_source(self.render_context)
 
     def create_graph(self) -> None:
         """Capture the step anew where the engine captures one (Warp on CUDA); else nothing."""
@@ -296,12 +349,33 @@ class Simulation:
             origins, directions, geom_groups, exclude_body_ids, max_distances
         )
 
+    def render(self, views: tuple[CameraView, ...]) -> list[Images]:
+        """Render what cameras see at the poses of the last `forward`; see `CameraView`, `Images`.
+
+        Camera sensors do this in `sense`. The images are overwritten by the next call.
+        """
+        return self._engine.render(views)
+
+    def render_context(self, views: tuple[CameraView, ...], view: CameraView) -> Any:
+        """Return MuJoCo Warp's context of a view, one of `views` that were rendered together.
+
+        AttributeError on another engine, RuntimeError before the first rendering.
+        """
+        if self.engine_name != "warp":
+            raise AttributeError(
+                f"A render context exists on the warp engine only; this is {self.engine_name}. "
+                "Read images from the camera sensors, which work on both."
+            )
+        engine: Any = self._engine
+        return engine.render_context(views, view)
+
     def jacobian(
         self, points: torch.Tensor, body_ids: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return translational and rotational Jacobians (N, 3, nv) of (N, 3) world points.
 
-        `body_ids` (N,) int32 says which body each point moves with.
+        `body_ids` (N,) int32 says which body each point moves with. Like `xpos` and all derived
+        fields, they belong to the state before the last substep, until `forward`.
         """
         return self._engine.jacobian(points, body_ids)
 

@@ -150,3 +150,12 @@ def test_its_state_can_be_saved_and_restored():
         buffer.append(torch.full((ROWS, 2), 9.0))
     assert torch.equal(ring.buffer, other.buffer)
     assert torch.equal(ring.current_length, other.current_length)
+
+
+def test_a_first_frame_under_inference_mode_does_not_forbid_later_ones_without_it() -> None:
+    buffer = CircularBuffer(2, 3, "cpu")
+    with torch.inference_mode():
+        buffer.append(torch.ones(3, 2))
+    buffer.append(torch.zeros(3, 2))
+    buffer.reset(torch.tensor([1]))
+    assert not buffer.buffer.is_inference()

@@ -115,3 +115,13 @@ def test_missing_configs_are_refused():
     cfg = NoiseModelWithAdditiveBiasCfg(noise_cfg=NO_NOISE)
     with pytest.raises(ValueError, match=r"bias_noise_cfg is None"):
         cfg.class_type(cfg, 5, "cpu")
+
+
+def test_data_that_comes_first_under_inference_mode_does_not_forbid_resets_without_it() -> None:
+    noise = UniformNoiseCfg(n_min=1.0, n_max=2.0)
+    model = NoiseModelWithAdditiveBiasCfg(noise_cfg=noise, bias_noise_cfg=noise)
+    built = NoiseModelWithAdditiveBias(model, num_envs=2, device="cpu")
+    with torch.inference_mode():
+        built(torch.zeros(2, 3))
+    built.reset(torch.tensor([0]))
+    assert built(torch.zeros(2, 3)).shape == (2, 3)

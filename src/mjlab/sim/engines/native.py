@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import difflib
+import functools
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ import torch
 
 from mjlab.sim.engine import ROTATION_MATRICES, Capabilities, Engine, EngineUnavailableError
 from mjlab.sim.engines.field_lists import (
+    COLLISION_MASKS,
     CONSTANTS_AT_QPOS0,
     FIXED_CONSTANTS,
     INPUTS,
@@ -28,10 +30,12 @@ from mjlab.sim.engines.native_first_step import FirstStep
 from mjlab.sim.engines.native_midphase import FIELDS as MIDPHASE_FIELDS
 from mjlab.sim.engines.native_midphase import MidphaseMargins
 from mjlab.sim.engines.native_rays import NativeRays
+from mjlab.sim.engines.native_render import NativeRenderer, render_problem
 from mjlab.sim.engines.sensor_fed import refuse_without_sensor
 
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
+    from mjlab.sim.rendering import CameraView, Images
 
 # State components that physics itself changes: bound from the start, so that `reset` can reach
 # them. The others change only by being written, and whoever writes them binds them first.
@@ -105,6 +109,7 @@ class NativeEngine(Engine):
         self._history = _state_slice(self._model, mujoco.mjtState.mjSTATE_HISTORY)
         self._history0 = self._batch.bind("state")[0, self._history].copy()
         self._rays: NativeRays | None = None
+        self._renderer: NativeRenderer | None = None
         threads = self._batch.num_threads
         self.capabilities = Capabilities(
             name="native",
@@ -114,6 +119,7 @@ class NativeEngine(Engine):
                 f"device cpu, {threads} physics thread{'s' if threads != 1 else ''}"
             ),
             num_threads=threads,
+            render_problem=render_problem(self._model),
         )
         self._batch.forward()
 
@@ -206,6 +212,13 @@ class NativeEngine(Engine):
                 "spec (spec=...), or compile those bodies with simple='false'."
             )
 
+    def hide_geoms(self, absent: torch.Tensor) -> None:
+        # The compiler's own use of these is for bodies as a whole, and a superset does no harm.
+        for name in COLLISION_MASKS:
+            array = self._batch.expand(name)
+            array[absent.numpy()] = 0
+            self._model_arrays[name], self._model_tensors[name] = array, _as_tensor(name, array)
+
     # Physics.
 
     def step(self, nstep: int) -> None:
@@ -281,11 +294,10 @@ class NativeEngine(Engine):
         max_distances: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         if self._rays is None:
-            threads = self._batch.num_threads
             self._rays = NativeRays(
                 self._model,
                 self._batch,
-                lambda model, count: mjbatch.Batch(model, count, threads),
+                self._make_batch,
                 lambda: (
                     self.data_field("geom_xpos").numpy(),
                     self.data_field("geom_xmat").numpy(),
@@ -297,7 +309,7 @@ class NativeEngine(Engine):
             geom_groups,
             exclude_body_ids,
             max_distances,
-            self._model_arrays.keys(),
+            self._model_tensors,
         )
         return (
             torch.from_numpy(hits.distances),
@@ -305,19 +317,55 @@ class NativeEngine(Engine):
             torch.from_numpy(hits.geoms),
         )
 
+    def render(self, views: tuple[CameraView, ...]) -> list[Images]:
+        if self.capabilities.render_problem is not None:
+            raise EngineUnavailableError(self.capabilities.render_problem)
+        if self._renderer is None:
+            self._renderer = NativeRenderer(
+                self._model,
+                self.num_envs,
+                self._batch.num_threads,
+                self._make_batch,
+                self.data_field,
+                self._model_tensors,
+            )
+        return self._renderer.render(views)
+
+    def _make_batch(
+        self, model: mujoco.MjModel, count: int, num_threads: int | None = None
+    ) -> mjbatch.Batch:
+        """Make simulations of another model, for what is asked of this one."""
+        return mjbatch.Batch(model, count, num_threads or self._batch.num_threads)
+
     def jacobian(
         self, points: torch.Tensor, body_ids: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        shape = (self.num_envs, 3, self._model.nv)
-        translational = np.empty(shape, dtype=np.float32)
-        rotational = np.empty(shape, dtype=np.float32)
-        self._batch.jac(
-            translational,
-            rotational,
-            np.ascontiguousarray(points.numpy()),
-            np.ascontiguousarray(body_ids.numpy().astype(np.int32)),
-        )
-        return torch.from_numpy(translational), torch.from_numpy(rotational)
+        # Not mjbatch's own, which belongs to the present qpos: in the middle of a step that is one
+        # substep newer than the positions that the points come from.
+        axes, com = self.data_field("cdof"), self.data_field("subtree_com")
+        body_ids = body_ids.long()
+        moves = self._moving_dofs[body_ids][..., None]
+        rows = torch.arange(self.num_envs)
+        arm = points - com[rows, self._tree_roots[body_ids]]
+        rotational = axes[..., :3] * moves
+        translational = axes[..., 3:] * moves
+        translational += torch.linalg.cross(rotational, arm[:, None].expand_as(rotational))
+        return translational.mT, rotational.mT
+
+    @functools.cached_property
+    def _moving_dofs(self) -> torch.Tensor:
+        """(nbody, nv) whether a body moves with a degree of freedom."""
+        moves = np.zeros((self._model.nbody, self._model.nv), dtype=np.float32)
+        for body in range(1, self._model.nbody):
+            moves[body] = moves[self._model.body_parentid[body]]
+            first = self._model.body_dofadr[body]
+            moves[body, first : first + self._model.body_dofnum[body]] = 1.0
+        return torch.from_numpy(moves)
+
+    @functools.cached_property
+    def _tree_roots(self) -> torch.Tensor:
+        """(nbody,) the body at the top of each body's tree, whose centre of mass `cdof` is about."""
+        return torch.from_numpy(self._model.body_rootid.astype(np.int64))
 
     # Copies.
 

@@ -20,8 +20,14 @@ from mjlab.envs.mdp.actions.actions import (
     TendonVelocityAction,
     TendonVelocityActionCfg,
 )
+from mjlab.envs.mdp.actions.differential_ik import (
+    DifferentialIKAction,
+    DifferentialIKActionCfg,
+)
 
 __all__ = [
+    "DifferentialIKAction",
+    "DifferentialIKActionCfg",
     "JointEffortAction",
     "JointEffortActionCfg",
     "JointPositionAction",

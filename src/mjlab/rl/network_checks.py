@@ -1,0 +1,131 @@
+"""Whether the networks of a run can take the observations that its config gives them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from mjlab.rl.rsl import CNN, CNNModel, MLPModel, TensorDict, resolve_callable
+
+_MODELS = ("actor", "critic", "student", "teacher")
+# Keys of a CNN config that are not for rsl_rl's CNN.
+_SPATIAL_SOFTMAX_KEYS = ("spatial_softmax", "spatial_softmax_temperature")
+_EXAMPLE = (
+    "class_name='CNNModel' or 'mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel', with "
+    "cnn_cfg={'output_channels': [16, 32], 'kernel_size': [5, 3], 'stride': [2, 2], "
+    "'padding': 'zeros'}"
+)
+
+
+def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
+    """Refuse networks that cannot take their observations.
+
+    Args:
+        observations: Observations of the environment.
+        cfg: The runner's config as a dict.
+
+    Raises:
+        ValueError: naming the network and the group of observations, and what to do.
+    """
+    shared = bool(cfg["algorithm"].get("share_cnn_encoders"))
+    images = {}
+    for model in _MODELS:
+        if isinstance(cfg.get(model), dict):
+            images[model] = _check_model(observations, cfg, model, shared)
+    if shared:
+        _check_sharing(images)
+
+
+def _check_model(
+    observations: TensorDict, cfg: Mapping[str, Any], model: str, shared: bool
+) -> tuple[str, ...] | None:
+    """Check one network; return the image groups that it encodes, None without encoders."""
+    given = (cfg.get("obs_groups") or {}).get(model, (model,))
+    # What is not there is refused by rsl_rl, which lists what is.
+    groups = {name: observations[name] for name in given if name in observations}
+    for name, value in groups.items():
+        _check_group(name, value)
+    images = tuple(name for name, value in groups.items() if value.ndim == 4)
+    kind = resolve_callable(cfg[model]["class_name"])
+    if isinstance(kind, type) and issubclass(kind, CNNModel):
+        if groups and not images:
+            raise ValueError(
+                f"The {model} has image encoders (class_name {cfg[model]['class_name']!r}), and "
+                f"its observation groups {list(groups)} have no images, which are (channels, "
+                "height, width). Use class_name='MLPModel', or add a group of images to "
+                f"obs_groups[{model!r}]."
+            )
+        if model != "critic" or not shared:
+            _check_encoders(model, cfg[model].get("cnn_cfg"), {n: groups[n] for n in images})
+        return images
+    # Models of other packages may take what they like.
+    if images and getattr(kind, "_get_obs_dim", None) is MLPModel._get_obs_dim:
+        raise ValueError(
+            f"The {model} (class_name {cfg[model]['class_name']!r}) takes flat observations only, "
+            f"and its observation group {images[0]!r} holds images of shape "
+            f"{tuple(groups[images[0]].shape[1:])}. Give it an image encoder ({_EXAMPLE}), or "
+            f"take {images[0]!r} out of obs_groups[{model!r}]."
+        )
+    return None
+
+
+def _check_group(name: str, value: Any) -> None:
+    if not isinstance(value, torch.Tensor):
+        raise ValueError(
+            f"The observation group {name!r} is a dict of {sorted(value.keys())}, and networks "
+            "take tensors. Set concatenate_terms=True, or make a group of each term."
+        )
+    if value.ndim not in (2, 4):
+        raise ValueError(
+            f"The observation group {name!r} has shape {tuple(value.shape[1:])} for each "
+            "environment; networks take flat observations (size,) and images (channels, height, "
+            "width). Flatten it (flatten_history_dim=True where it is a history)."
+        )
+    if not value.is_floating_point():
+        raise ValueError(
+            f"The observation group {name!r} is of {value.dtype}, and networks take floating-point "
+            "numbers. Convert it in its observation term."
+        )
+
+
+def _check_encoders(model: str, cnn_cfg: Any, images: dict[str, torch.Tensor]) -> None:
+    if not cnn_cfg:
+        raise ValueError(f"The {model} sees images {list(images)} and has no cnn_cfg. {_EXAMPLE}")
+    by_group = all(isinstance(value, dict) for value in cnn_cfg.values())
+    if by_group and set(cnn_cfg) != set(images):
+        raise ValueError(
+            f"The {model}'s cnn_cfg has configs for {sorted(cnn_cfg)}, and its image groups are "
+            f"{sorted(images)}; give one for each, or one for all."
+        )
+    for name, value in images.items():
+        own = cnn_cfg[name] if by_group else cnn_cfg
+        settings = {k: v for k, v in own.items() if k not in _SPATIAL_SOFTMAX_KEYS}
+        try:
+            # On the meta device nothing is computed and no random number is drawn.
+            with torch.device("meta"):
+                _, channels, height, width = value.shape
+                encoder = CNN((height, width), channels, **settings)
+                encoder(torch.empty(1, *value.shape[1:]))
+        except (RuntimeError, TypeError, ValueError, IndexError, KeyError) as error:
+            raise ValueError(
+                f"The {model}'s cnn_cfg makes no encoder for the images {name!r} of shape "
+                f"{tuple(value.shape[1:])}: {str(error).splitlines()[0]}. The settings are "
+                f"{settings}; images have to be large enough for all layers."
+            ) from error
+
+
+def _check_sharing(images: Mapping[str, tuple[str, ...] | None]) -> None:
+    actor, critic = images.get("actor"), images.get("critic")
+    if actor is None or critic is None or set(actor) != set(critic):
+        raise ValueError(
+            "algorithm.share_cnn_encoders is True, so actor and critic need image encoders for the "
+            f"same groups; the actor has them for {_listed(actor)}, the critic for "
+            f"{_listed(critic)}. Give both the same image groups in obs_groups and a CNN class, or "
+            "set share_cnn_encoders=False."
+        )
+
+
+def _listed(groups: tuple[str, ...] | None) -> str:
+    return "none" if not groups else str(list(groups))

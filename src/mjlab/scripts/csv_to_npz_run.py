@@ -1,0 +1,203 @@
+"""Converting recordings into motions: reading, resampling, writing, showing, uploading."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mjlab.scripts.cli import UserError, tell
+from mjlab.tasks.tracking.motion_csv import read_csv
+from mjlab.tasks.tracking.motion_file import Motion, read_motion, write_motion
+from mjlab.tasks.tracking.motion_kinematics import (
+    Recording,
+    make_motion,
+    recording_of,
+    resampled,
+)
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from mjlab.entity import Entity
+
+_WANDB_PROJECT = "csv_to_npz"
+_ARTIFACT_TYPE = "motions"
+# As mjlab 1.6 calls it, so that its `play` finds it.
+_ARTIFACT_FILE = "motion.npz"
+_VIDEO_SIZE = (480, 640)
+
+
+@dataclass
+class CsvToNpzConfig:
+    """Flags of `csv_to_npz`."""
+
+    input_file: str = ""
+    """The recording: a .csv of poses, or a motion (.npz)."""
+    output_file: str | None = None
+    """Where the motion goes. None: beside the working folder's other files, as `output_name`."""
+    output_name: str | None = None
+    """Name of the motion, and of the artifact that is uploaded. None: that of the input."""
+    input_fps: float = 30.0
+    """Poses per second of a .csv; an .npz says so itself."""
+    output_fps: float = 50.0
+    """Frames per second of the motion: the task's control rate."""
+    line_range: tuple[int, int] | None = None
+    """First and last line (or frame) to take, counted from 1; both are taken. None takes all."""
+    robot: str = "g1"
+    """The robot: g1, go1, or `module:function` that returns its EntityCfg."""
+    render: bool = False
+    """Record the motion as a video beside the output."""
+    view: bool = False
+    """Serve a page in the browser that plays the motion."""
+    port: int = 8080
+    """Port of that page; the next free one where it is taken."""
+    upload: bool = False
+    """Upload the motion to Weights & Biases as an artifact, and link it into the registry."""
+    device: str | None = None
+    """Without effect, for scripts that were written for mjlab 1.6: the conversion is a matter of
+    seconds on the CPU."""
+
+
+def convert(cfg: CsvToNpzConfig) -> Path:
+    """Convert as `cfg` says; return the path of the motion.
+
+    Raises:
+        UserError: a flag makes no sense.
+        MotionFileError: the input is no recording of this robot.
+    """
+    if not cfg.input_file:
+        raise UserError("--input-file names the recording, a .csv or an .npz.")
+    for name in ("input_fps", "output_fps"):
+        if not getattr(cfg, name) > 0.0:
+            flag = name.replace("_", "-")
+            raise UserError(f"--{flag} is {getattr(cfg, name)}; it has to be above 0.")
+    robot = _robot(cfg.robot)
+    source = Path(cfg.input_file)
+    name = cfg.output_name or source.stem
+    target = Path(cfg.output_file) if cfg.output_file else Path(f"{name}.npz")
+    if target.resolve() == source.resolve():
+        raise UserError(f"The output {target} would overwrite the input; give --output-file.")
+    recording = _read(cfg, source, robot)
+    model = robot.compile()
+    motion = make_motion(
+        resampled(recording, cfg.output_fps), model, robot.joint_names, robot.body_names
+    )
+    path = write_motion(target, motion)
+    print(
+        f"Motion: {path}, {motion.num_frames} frames, {motion.num_frames / cfg.output_fps:.2f} s "
+        f"at {cfg.output_fps:g} per second"
+    )
+    if cfg.render:
+        _record(motion, robot, path.with_suffix(".mp4"))
+    if cfg.upload:
+        _upload(path, name)
+    if cfg.view:
+        from mjlab.scripts.motion_page import show_motion
+
+        show_motion(motion, _stage(robot), cfg.port)
+    return path
+
+
+def _read(cfg: CsvToNpzConfig, source: Path, robot: Entity) -> Recording:
+    if source.suffix != ".npz":
+        return read_csv(source, cfg.input_fps, robot.joint_names, cfg.line_range)
+    motion = read_motion(source)
+    recording = recording_of(motion, motion.fps or cfg.input_fps)
+    if cfg.line_range is None:
+        return recording
+    first, last = cfg.line_range
+    if not 1 <= first < last <= len(recording):
+        raise UserError(
+            f"--line-range is {cfg.line_range}; {source} has frames 1 to {len(recording)}, of which "
+            "at least two are needed."
+        )
+    kept = slice(first - 1, last)
+    return Recording(
+        fps=recording.fps,
+        root_pos=recording.root_pos[kept],
+        root_quat=recording.root_quat[kept],
+        joint_pos=recording.joint_pos[kept],
+    )
+
+
+def _robot(name: str) -> Entity:
+    """Return the robot of that name, or of `module:function`."""
+    from mjlab.asset_zoo.robots import get_g1_robot_cfg, get_go1_robot_cfg
+
+    known: dict[str, Callable[[], Any]] = {"g1": get_g1_robot_cfg, "go1": get_go1_robot_cfg}
+    if name in known:
+        return known[name]().build()
+    module, colon, function = name.partition(":")
+    if not colon:
+        raise UserError(
+            f"--robot is {name!r}; it is one of {', '.join(known)}, or `module:function` that "
+            "returns an EntityCfg."
+        )
+    try:
+        make = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        raise UserError(f"--robot {name}: {error}.") from error
+    return make().build()
+
+
+def _stage(robot: Entity) -> mujoco.MjModel:
+    """Return the robot on a floor, to look at."""
+    import mujoco
+
+    spec = robot.cfg.build().spec
+    floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE)
+    floor.size, floor.rgba = (10.0, 10.0, 0.1), (0.75, 0.78, 0.82, 1.0)
+    spec.worldbody.add_light(pos=(1.0, -1.0, 4.0), dir=(-0.2, 0.2, -1.0))
+    return spec.compile()
+
+
+def _record(motion: Motion, robot: Entity, path: Path) -> None:
+    """Write a video of the motion."""
+    import mujoco
+
+    from mjlab.viewer.clip_writer import ClipWriter
+    from mjlab.viewer.gl_context import open_renderer
+
+    model = _stage(robot)
+    data, camera, option = mujoco.MjData(model), mujoco.MjvCamera(), mujoco.MjvOption()
+    camera.distance, camera.azimuth, camera.elevation = 3.0, 120.0, -10.0
+    renderer = open_renderer(model, *_VIDEO_SIZE)
+    writer = ClipWriter(path, motion.fps or 50.0)
+    try:
+        for frame in range(motion.num_frames):
+            pose(model, data, motion, frame)
+            camera.lookat = data.subtree_com[0]
+            renderer.update_scene(data, camera, option)
+            writer.add(renderer.render())
+    finally:
+        renderer.close()
+        written = writer.close()
+    print(f"Video:  {written}")
+
+
+def pose(model: mujoco.MjModel, data: mujoco.MjData, motion: Motion, frame: int) -> None:
+    """Put a robot, whose free joint comes first, onto a frame of its motion."""
+    import mujoco
+
+    data.qpos[:3], data.qpos[3:7] = motion.body_pos_w[frame, 0], motion.body_quat_w[frame, 0]
+    data.qpos[7:] = motion.joint_pos[frame]
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+
+
+def _upload(path: Path, name: str) -> None:
+    """Upload a motion as an artifact, and link it into the registry of motions."""
+    import wandb
+
+    run = wandb.init(project=_WANDB_PROJECT, name=name)
+    try:
+        artifact = wandb.Artifact(name=name, type=_ARTIFACT_TYPE)
+        artifact.add_file(str(path), name=_ARTIFACT_FILE)
+        logged = run.log_artifact(artifact)
+        run.link_artifact(logged, target_path=f"wandb-registry-{_ARTIFACT_TYPE}/{name}")
+    finally:
+        run.finish()
+    tell(f"Uploaded as wandb-registry-{_ARTIFACT_TYPE}/{name}.")

@@ -1,0 +1,131 @@
+"""A page in the browser that shows the states which led to a NaN."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import mujoco
+import numpy as np
+import viser
+
+from mjlab.utils.nan_guard import NanDump
+from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS, host_model
+from mjlab.viewer.viser.scene import MjlabViserScene
+
+_FIELDS = ("qpos", "qvel", "act", "ctrl", "xfrc_applied", "qacc")
+_SHOWN_ENVS = 10
+
+
+class NanPage:
+    """Shows the recorded states of one environment, with sliders for substep and environment.
+
+    Controls only ask for another state; it is set, computed and drawn in the thread that calls
+    `run`.
+    """
+
+    def __init__(self, server: viser.ViserServer, dump: NanDump, model: mujoco.MjModel) -> None:
+        """Build the page, and show the last state: the one that led to the NaN.
+
+        Args:
+            server: The page's server.
+            dump: The dump.
+            model: The model it was recorded with; a copy is made, into which the values of the
+                environment in view are written.
+        """
+        self.dump = dump
+        self.model = host_model(model)
+        self.data = mujoco.MjData(self.model)
+        self._envs: list[int] = dump.metadata["dumped_env_ids"]
+        self._looks_differ = any(
+            name.removeprefix("model_") in VIEWER_MODEL_FIELDS
+            for name in dump.arrays
+            if name.startswith("model_")
+        )
+        self._row_shown = 0
+        self._changed = threading.Event()
+        gui = server.gui
+        gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        dump.apply(dump.steps[-1], 0, self.model, self.data)
+        self.scene = MjlabViserScene(server, self.model, 1)
+        self.scene.set_refresh_handler(self._changed.set)
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("States", icon=viser.Icon.BUG):
+            self._status = gui.add_markdown("")
+            self._step = gui.add_slider(
+                "Step", 0, max(len(dump.steps) - 1, 1), 1, len(dump.steps) - 1,
+                disabled=len(dump.steps) == 1, hint="Recorded substep; the last led to the NaN.",
+            )  # fmt: skip
+            self._env = gui.add_slider(
+                "Environment", 0, max(len(self._envs) - 1, 1), 1, 0,
+                visible=len(self._envs) > 1, hint="Which of the recorded environments.",
+            )  # fmt: skip
+            with gui.add_folder("Scene"):
+                self.scene.create_scene_gui()
+        with tabs.add_tab("Visualization", icon=viser.Icon.EYE):
+            self.scene.create_overlay_gui()
+        with tabs.add_tab("Groups", icon=viser.Icon.LAYERS_INTERSECT):
+            self.scene.create_groups_gui()
+        for slider in (self._step, self._env):
+            slider.on_update(lambda _: self._changed.set())
+        self.show()
+
+    @property
+    def status(self) -> str:
+        """The text above the controls."""
+        return self._status.content
+
+    def run(self) -> None:
+        """Show what is asked for, until Ctrl-C."""
+        while True:
+            if self._changed.wait(timeout=0.2):
+                self.show()
+
+    def show(self) -> None:
+        """Show the state that the sliders name."""
+        self._changed.clear()
+        index = min(int(self._step.value), len(self.dump.steps) - 1)
+        row = min(int(self._env.value), len(self._envs) - 1)
+        mujoco.mj_resetData(self.model, self.data)
+        self.dump.apply(self.dump.steps[index], row, self.model, self.data)
+        # MuJoCo refuses to compute from a state that is not finite; where bodies are is unknown.
+        is_finite = all(np.isfinite(getattr(self.data, name)).all() for name in ("qpos", "qvel"))
+        if is_finite:
+            mujoco.mj_forward(self.model, self.data)
+            if row != self._row_shown and self._looks_differ:
+                self.scene.rebuild_visual_handles()
+            self._row_shown = row
+            self.scene.update_from_mjdata(self.data)
+        self._status.content = self._describe(index, row)
+
+    def _describe(self, index: int, row: int) -> str:
+        metadata, env = self.dump.metadata, self._envs[row]
+        ids = metadata["nan_env_ids"]
+        shown = ", ".join(map(str, ids[:_SHOWN_ENVS])) + (" ..." if len(ids) > _SHOWN_ENVS else "")
+        lines = [
+            f"**Substep {self.dump.steps[index]}** ({index + 1} of {len(self.dump.steps)} recorded; "
+            f"NaN found after substep {metadata['detection_step'] - 1})",
+            f"**Environment {env}**: {'went NaN' if env in ids else 'clean'}",
+            f"Environments with NaN: {shown} ({len(ids)} of {metadata['num_envs_total']})",
+            *self._findings(),
+        ]
+        return "\n\n".join(lines)
+
+    def _findings(self) -> list[str]:
+        """Return what is not finite in the state, or else what is largest."""
+        bad = [name for name in _FIELDS if not np.isfinite(getattr(self.data, name)).all()]
+        if bad:
+            return [f"Not finite here: {', '.join(bad)}"]
+        if self.model.nv == 0:
+            return []
+        return [
+            f"Largest |{name}|: {_largest(self.model, getattr(self.data, name))}"
+            for name in ("qvel", "qacc")
+        ]
+
+
+def _largest(model: mujoco.MjModel, values: Any) -> str:
+    dof = int(np.abs(values).argmax())
+    joint = int(model.dof_jntid[dof])
+    name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"joint {joint}"
+    return f"{abs(values[dof]):.3g} ({name})"

@@ -1,0 +1,78 @@
+"""Serving the page that shows a NaN dump."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+
+from mjlab.scripts.cli import UserError
+from mjlab.utils.nan_guard import NanDump
+
+
+@dataclass(frozen=True)
+class VizNanConfig:
+    """Flags of `viz-nan`."""
+
+    host: str = "127.0.0.1"
+    """Address to serve on; `0.0.0.0` serves the whole network."""
+    port: int = 8080
+    """Port to serve on; the next free one where it is taken."""
+
+
+def run_viz_nan(path: str, cfg: VizNanConfig) -> None:
+    """Serve the page of the dump at `path` until Ctrl-C.
+
+    Raises:
+        UserError: the dump or its model is missing or cannot be read.
+    """
+    if not 1 <= cfg.port <= 65535:
+        raise UserError(f"--port is {cfg.port}; ports go from 1 to 65535.")
+    dump, model = load_dump(path)
+    import viser
+
+    from mjlab.scripts.nan_page import NanPage
+
+    server = viser.ViserServer(host=cfg.host, port=cfg.port, verbose=False)
+    page = NanPage(server, dump, model)
+    print(f"Serving {path} on http://localhost:{server.get_port()} (Ctrl-C stops).", flush=True)
+    try:
+        page.run()
+    finally:
+        server.stop()
+
+
+def load_dump(path: str) -> tuple[NanDump, mujoco.MjModel]:
+    """Return a dump and the model it was recorded with.
+
+    Raises:
+        UserError: either is missing or cannot be read; the text says which and why.
+    """
+    try:
+        dump = NanDump.load(path)
+    except FileNotFoundError:
+        raise UserError(
+            f"There is no dump {path}. `train --enable-nan-guard True` writes one when a NaN "
+            "appears, and says where."
+        ) from None
+    if not dump.steps:
+        raise UserError(f"The dump {path} holds no states.")
+    if not dump.model_file.is_file():
+        raise UserError(
+            f"The dump {path} needs its model, {dump.model_file.name}, in the same folder. Copy "
+            "both."
+        )
+    try:
+        model = mujoco.MjModel.from_binary_path(str(dump.model_file))
+    except (ValueError, RuntimeError) as error:
+        raise UserError(
+            f"The model {dump.model_file} cannot be read by MuJoCo {mujoco.__version__}; it has to "
+            f"be the version that wrote it. {error}"
+        ) from error
+    size = mujoco.mj_stateSize(model, dump.metadata["state_spec"])
+    if size != dump.metadata["state_size"]:
+        raise UserError(
+            f"The dump {path} has states of {dump.metadata['state_size']} numbers and its model "
+            f"{dump.model_file.name} of {size}: they are not of the same simulation."
+        )
+    return dump, model

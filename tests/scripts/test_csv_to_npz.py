@@ -1,0 +1,310 @@
+"""Turning recordings into motions: nothing is lost, rates change, velocities fit, mistakes are told."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mjlab.asset_zoo.robots import get_g1_robot_cfg
+from mjlab.scripts.cli import UserError
+from mjlab.scripts.csv_to_npz_run import CsvToNpzConfig, convert
+from mjlab.scripts.motion_page import MotionPage
+from mjlab.tasks.tracking.motion_csv import read_csv, write_csv
+from mjlab.tasks.tracking.motion_file import MotionFileError, read_motion
+from mjlab.tasks.tracking.motion_kinematics import (
+    Recording,
+    angular_velocities,
+    recording_of,
+    resampled,
+    slerp,
+)
+
+JOINTS = get_g1_robot_cfg().build().joint_names
+
+
+def recording(frames=91, fps=30.0, speed=1.0) -> Recording:
+    """Return a robot that goes along a curve, turns about a skew axis, and moves all joints."""
+    t = np.arange(frames)[:, None] / fps
+    axis = np.array([0.3, -0.4, 0.8]) / np.linalg.norm([0.3, -0.4, 0.8])
+    half = 0.5 * speed * np.sin(1.3 * t)
+    return Recording(
+        fps=fps,
+        root_pos=np.hstack((0.8 * t, np.sin(t), 0.75 + 0.05 * np.cos(2.0 * t))),
+        root_quat=np.hstack((np.cos(half), np.sin(half) * axis)),
+        joint_pos=0.4 * np.sin(2.0 * t + np.arange(29)),
+    )
+
+
+@pytest.fixture
+def csv(tmp_path) -> Path:
+    path = tmp_path / "dance.csv"
+    write_csv(path, recording())
+    return path
+
+
+def converted(csv, tmp_path, **flags):
+    target = tmp_path / "out" / "dance.npz"
+    convert(CsvToNpzConfig(input_file=str(csv), output_file=str(target), **flags))
+    return read_motion(target)
+
+
+def angles(one, other) -> np.ndarray:
+    """Return the angles between unit quaternions, in degrees."""
+    chord = np.minimum(np.linalg.norm(one - other, axis=-1), np.linalg.norm(one + other, axis=-1))
+    return np.degrees(4.0 * np.arcsin(np.clip(chord / 2.0, 0.0, 1.0)))
+
+
+@pytest.mark.parametrize(
+    ("output_fps", "source_step", "motion_step"),
+    [(30.0, 1, 1), (50.0, 3, 5), (60.0, 1, 2), (120.0, 1, 4)],
+)
+def test_to_a_motion_and_back_nothing_is_lost(csv, tmp_path, output_fps, source_step, motion_step):
+    motion = converted(csv, tmp_path, output_fps=output_fps)
+    back = tmp_path / "back.csv"
+    write_csv(back, recording_of(motion, output_fps))
+    source, again = read_csv(csv, 30.0, JOINTS), read_csv(back, output_fps, JOINTS)
+    # The times that both have; the last pose begins no interval.
+    times = slice(None, -1 if source_step == 1 else None, source_step)
+    wanted = source.root_pos[times][: len(again.root_pos[::motion_step])]
+    count = len(wanted)
+    assert count >= 30
+    assert np.abs(again.root_pos[::motion_step] - wanted).max() < 1e-4
+    assert angles(again.root_quat[::motion_step], source.root_quat[times][:count]).max() < 0.01
+    joints = np.degrees(again.joint_pos[::motion_step] - source.joint_pos[times][:count])
+    assert np.abs(joints).max() < 0.01
+
+
+@pytest.mark.parametrize("fps", [30.0, 50.0, 120.0])
+def test_velocities_are_the_finite_differences_of_positions(csv, tmp_path, fps):
+    motion = converted(csv, tmp_path, output_fps=fps)
+    for position, velocity in (
+        (motion.joint_pos, motion.joint_vel),
+        (motion.body_pos_w, motion.body_lin_vel_w),
+    ):
+        expected = np.gradient(position.astype(np.float64), 1.0 / fps, axis=0)
+        assert np.sqrt(np.mean((expected - velocity) ** 2)) < 0.02 * np.ptp(velocity)
+    angular = np.stack(
+        [
+            angular_velocities(motion.body_quat_w[:, i].astype(np.float64), 1.0 / fps)
+            for i in range(30)
+        ],
+        axis=1,
+    )
+    error = np.sqrt(np.mean((angular - motion.body_ang_vel_w) ** 2))
+    assert error < 0.02 * np.ptp(motion.body_ang_vel_w)
+
+
+def test_a_motion_has_the_layout_that_the_task_reads(csv, tmp_path):
+    motion = converted(csv, tmp_path)
+    # 91 poses at 30 per second are 3 s.
+    assert (motion.fps, motion.num_frames) == (50.0, 150)
+    assert motion.joint_pos.shape == motion.joint_vel.shape == (150, 29)
+    assert motion.body_pos_w.shape == (150, 30, 3)
+    assert motion.body_quat_w.shape == (150, 30, 4)
+    assert motion.joint_names == JOINTS
+    assert motion.body_names[0] == "pelvis"
+    np.testing.assert_allclose(motion.body_pos_w[0, 0], [0.0, 0.0, 0.8], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("poses", "fps_in", "fps_out", "frames"),
+    [(301, 30, 50, 500), (301, 30, 30, 300), (2, 30, 50, 2), (120, 120, 50, 50), (91, 60, 50, 75)],
+)
+def test_the_number_of_frames_is_that_of_the_interface(poses, fps_in, fps_out, frames):
+    assert len(resampled(recording(poses, fps_in), fps_out)) == frames
+
+
+def test_a_slow_turn_is_even(tmp_path):
+    """At 0.05 rad/s, neighbours at 30 per second are 1.7e-3 rad apart."""
+    t = np.arange(91)[:, None] / 30.0
+    quat = np.hstack((np.cos(0.025 * t), 0.0 * t, 0.0 * t, np.sin(0.025 * t)))
+    slow = Recording(
+        fps=30.0, root_pos=np.zeros((91, 3)), root_quat=quat, joint_pos=np.zeros((91, 29))
+    )
+    rates = angular_velocities(resampled(slow, 50.0).root_quat, 0.02)
+    np.testing.assert_allclose(rates[:, 2], 0.05, rtol=1e-6)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    angle=st.one_of(st.floats(1e-9, 1e-3), st.floats(1e-3, 3.1)),
+    share=st.floats(0.0, 1.0),
+    flip=st.booleans(),
+)
+def test_slerp_turns_by_the_share_of_the_angle_the_short_way(angle, share, flip):
+    start = np.array([np.cos(0.2), np.sin(0.2), 0.0, 0.0])
+    end = np.array([np.cos(0.2 + angle / 2), np.sin(0.2 + angle / 2), 0.0, 0.0])
+    result = slerp(start, -end if flip else end, np.array([share]))
+    expected = [np.cos(0.2 + share * angle / 2), np.sin(0.2 + share * angle / 2), 0.0, 0.0]
+    np.testing.assert_allclose(result, expected, atol=1e-12)
+
+
+def test_a_range_of_lines_is_both_ends_included_counted_from_one(csv, tmp_path):
+    motion = converted(csv, tmp_path, line_range=(11, 41), output_fps=30.0)
+    assert motion.num_frames == 30
+    source = read_csv(csv, 30.0, JOINTS)
+    np.testing.assert_allclose(motion.joint_pos[0], source.joint_pos[10], atol=1e-6)
+
+
+def test_a_motion_can_be_brought_to_another_rate(csv, tmp_path):
+    first = converted(csv, tmp_path, output_fps=100.0)
+    target = tmp_path / "half.npz"
+    convert(CsvToNpzConfig(input_file=str(tmp_path / "out" / "dance.npz"), output_file=str(target)))
+    second = read_motion(target)
+    assert second.fps == 50.0
+    np.testing.assert_allclose(second.joint_pos, first.joint_pos[: 2 * 150 : 2], atol=1e-6)
+
+
+def test_the_output_goes_where_it_was_asked_to_and_nowhere_else(csv, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    path = convert(CsvToNpzConfig(input_file=str(csv)))
+    assert path == Path("dance.npz")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["dance.csv", "dance.npz"]
+    path = convert(CsvToNpzConfig(input_file=str(csv), output_name="waltz"))
+    assert path == Path("waltz.npz")
+
+
+def test_a_motion_is_uploaded_only_on_request(csv, tmp_path, monkeypatch):
+    calls = []
+
+    class Artifact:
+        def __init__(self, name, type):
+            calls.append((name, type))
+
+        def add_file(self, path, name):
+            calls.append((Path(path).name, name))
+
+    run = SimpleNamespace(
+        log_artifact=lambda artifact: artifact,
+        link_artifact=lambda artifact, target_path: calls.append(target_path),
+        finish=lambda: calls.append("finished"),
+    )
+    wandb = SimpleNamespace(init=lambda project, name: run, Artifact=Artifact)
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    converted(csv, tmp_path)
+    assert not calls
+    converted(csv, tmp_path, upload=True)
+    assert calls == [
+        ("dance", "motions"),
+        ("dance.npz", "motion.npz"),
+        "wandb-registry-motions/dance",
+        "finished",
+    ]
+
+
+def test_a_video_is_written_beside_the_output(csv, tmp_path, monkeypatch):
+    frames = []
+    renderer = SimpleNamespace(
+        update_scene=lambda *args: None,
+        render=lambda: frames.append(1) or np.zeros((48, 64, 3), np.uint8),
+        close=lambda: None,
+    )
+    monkeypatch.setattr("mjlab.viewer.gl_context.open_renderer", lambda *args: renderer)
+    converted(csv, tmp_path, line_range=(1, 13), render=True)
+    assert len(frames) == 20
+    assert (tmp_path / "out" / "dance.mp4").stat().st_size > 500
+
+
+def a_line(**changes) -> str:
+    values = [0.0, 0.0, 0.8, 0.0, 0.0, 0.0, 1.0, *[0.0] * 29]
+    for column, value in changes.items():
+        values[int(column[1:])] = value
+    return ",".join(map(str, values))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "has 0 poses to read; at least 2"),
+        (a_line(), "has 1 poses to read"),
+        ("x,y,z\n" + a_line(), "is not a table of numbers"),
+        ("1,2,3\n4,5,6\n", "has 3 columns, and the robot needs 36"),
+        (f"{a_line()}\n{a_line(c8=float('nan'))}", "Line 2 of .* NaN"),
+        (f"{a_line()}\n{a_line(c6=0.5)}", "in line 2 the norm is 0.5"),
+    ],
+)
+def test_what_is_no_recording_is_refused(tmp_path, text, message):
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    with pytest.raises(MotionFileError, match=message):
+        convert(CsvToNpzConfig(input_file=str(path), output_file=str(tmp_path / "out.npz")))
+    assert not (tmp_path / "out.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({"input_file": ""}, "--input-file names the recording"),
+        ({"input_file": "none.csv"}, "There is no file none.csv"),
+        ({"input_fps": 0.0}, "--input-fps is 0.0"),
+        ({"output_fps": -50.0}, "--output-fps is -50.0"),
+        ({"line_range": (5, 200)}, "Lines 5 to 200 were asked for, and .* has lines 1 to 91"),
+        ({"line_range": (0, 5)}, "Lines 0 to 5"),
+        ({"robot": "h1"}, "--robot is 'h1'; it is one of g1, go1"),
+        ({"robot": "no.such:robot"}, "--robot no.such:robot: No module named 'no'"),
+        ({"robot": "go1"}, "has 36 columns, and the robot needs 19"),
+    ],
+)
+def test_flags_that_make_no_sense_are_refused(csv, tmp_path, flags, message):
+    cfg = CsvToNpzConfig(
+        **{"input_file": str(csv), "output_file": str(tmp_path / "o.npz"), **flags}
+    )
+    with pytest.raises((UserError, MotionFileError), match=message):
+        convert(cfg)
+
+
+def test_the_input_is_not_overwritten(csv, tmp_path, monkeypatch):
+    converted(csv, tmp_path)
+    monkeypatch.chdir(tmp_path / "out")
+    with pytest.raises(UserError, match="would overwrite the input"):
+        convert(CsvToNpzConfig(input_file="dance.npz"))
+
+
+def test_the_page_plays_the_motion_and_follows_the_slider(csv, tmp_path):
+    motion = converted(csv, tmp_path)
+    widgets, drawn = {}, []
+
+    class Widget(SimpleNamespace):
+        def on_update(self, callback):
+            self.callback = callback
+
+    def add(label, *values):
+        widgets[label] = Widget(value=values[-1])
+        return widgets[label]
+
+    page = MotionPage.__new__(MotionPage)
+    scene = SimpleNamespace(update_from_mjdata=lambda data: drawn.append(data.qpos.copy()))
+    server = SimpleNamespace(gui=SimpleNamespace(add_checkbox=add, add_slider=add))
+    model = get_g1_robot_cfg().build().compile()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mjlab.scripts.motion_page.ViserMujocoScene", lambda *a, **k: scene)
+        page.__init__(server, motion, model)
+    page.advance(0.5)
+    assert page.frame == widgets["Frame"].value == 25
+    np.testing.assert_allclose(drawn[-1][7:], motion.joint_pos[25], atol=1e-6)
+    page.advance(2.7)
+    assert page.frame == 10
+    widgets["Frame"].value = 90
+    widgets["Frame"].callback(SimpleNamespace(client=object()))
+    page.advance(1.0)
+    assert page.frame == 90
+    assert not widgets["Play"].value
+    assert len(drawn) == 3
+
+
+def test_its_help_needs_nothing_heavy():
+    code = (
+        "import sys; from mjlab.scripts import csv_to_npz; csv_to_npz._command(['--help']); "
+        "assert 'torch' not in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "--input-file FILE" in done.stdout

@@ -1,0 +1,154 @@
+"""The page that shows a NaN dump, without a browser."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from mjlab.scripts.cli import UserError
+from mjlab.scripts.nan_page import NanPage
+from mjlab.scripts.viz_nan import VizNanConfig, run_viz_nan
+from mjlab.scripts.viz_nan_run import load_dump
+from mjlab.utils.nan_guard import CHECKED_FIELDS, NanGuard, NanGuardCfg
+
+XML = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 .1"/>
+    <body name="arm" pos="0 0 1">
+      <joint name="shoulder" axis="0 1 0"/><geom name="arm" size=".1" pos=".5 0 0" mass="1"/>
+      <body name="hand" pos="1 0 0"><joint name="wrist" axis="0 1 0"/><geom size=".05" mass=".1"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="shoulder"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def dump_file(tmp_path: Path) -> Path:
+    """A dump of three substeps of environments 1 and 3, of which 3 has a larger arm."""
+    model = mujoco.MjModel.from_xml_string(XML)
+    sizes = torch.tensor(model.geom_size).float().expand(4, -1, -1).clone()
+    sizes[3, 1] = 0.3
+    guard = NanGuard(
+        NanGuardCfg(enabled=True, output_dir=str(tmp_path), buffer_size=3, max_envs_to_dump=2),
+        4, model, model_fields=lambda: {"geom_size": sizes},
+    )  # fmt: skip
+    names = (*CHECKED_FIELDS, "ctrl", "xfrc_applied", "act", "history")
+    widths = {"ctrl": 1, "act": 0, "history": 0, "sensordata": 0}
+    data = SimpleNamespace(**{name: torch.zeros(4, widths.get(name, 2)) for name in names})
+    data.xfrc_applied = torch.zeros(4, model.nbody, 6)
+    for step in range(4):
+        with guard.watch(data):
+            data.qpos[:, 0] = 0.1 * (step + 1)
+            data.qvel[:, 1] = 10.0 * (step + 1)
+            if step == 3:
+                data.qacc[[1, 3]] = torch.nan
+    return tmp_path / "nan_dump_latest.npz"
+
+
+def page_of(server, path: Path) -> NanPage:
+    return NanPage(server, *load_dump(str(path)))
+
+
+def test_the_page_opens_at_the_state_that_led_to_the_nan(viser_server, dump_file: Path) -> None:
+    page = page_of(viser_server, dump_file)
+    assert "Substep 3** (3 of 3 recorded; NaN found after substep 3)" in page.status
+    assert "Environment 1**: went NaN" in page.status
+    assert "Environments with NaN: 1, 3 (2 of 4)" in page.status
+    assert "Largest |qvel|: 30 (wrist)" in page.status
+    np.testing.assert_allclose(page.data.qpos, [0.3, 0.0], rtol=1e-6)
+    # Computed, so that bodies are where the state says.
+    assert page.data.body("hand").xpos[2] == pytest.approx(1.0 - np.sin(0.3))
+
+
+def test_sliders_choose_substep_and_environment(viser_server, dump_file: Path) -> None:
+    page = page_of(viser_server, dump_file)
+    assert page.model.geom("arm").size[0] == pytest.approx(0.1)
+    page._step.value = 0
+    page._env.value = 1
+    assert page._changed.is_set()
+    page.show()
+    assert "Substep 1** (1 of 3" in page.status
+    assert "Environment 3**" in page.status
+    np.testing.assert_allclose(page.data.qpos, [0.1, 0.0], rtol=1e-6)
+    # With the environment's own model.
+    assert page.model.geom("arm").size[0] == pytest.approx(0.3)
+
+
+def test_an_environment_that_did_not_go_nan_is_called_clean(viser_server, dump_file: Path) -> None:
+    dump, model = load_dump(str(dump_file))
+    dump.metadata["nan_env_ids"] = [3]
+    assert "Environment 1**: clean" in NanPage(viser_server, dump, model).status
+
+
+def test_a_state_that_is_not_finite_is_named_and_not_drawn(viser_server, dump_file: Path) -> None:
+    dump, model = load_dump(str(dump_file))
+    dump.arrays["states_step_000003"][0, 0] = np.nan
+    page = NanPage(viser_server, dump, model)
+    assert "Not finite here: qpos" in page.status
+    page._step.value = 1
+    page.show()
+    assert "Largest |qacc|" in page.status
+
+
+def test_a_single_state_of_a_single_environment_is_shown(viser_server, dump_file: Path) -> None:
+    dump, model = load_dump(str(dump_file))
+    dump.steps = dump.steps[-1:]
+    dump.metadata["dumped_env_ids"] = [1]
+    page = NanPage(viser_server, dump, model)
+    assert "(1 of 1 recorded" in page.status
+
+
+def test_what_cannot_be_shown_is_one_message(run, dump_file: Path, tmp_path: Path) -> None:
+    missing = run("viz_nan", str(tmp_path / "nothing.npz"))
+    assert missing.status == 1
+    assert "There is no dump" in missing.message
+    assert "--enable-nan-guard" in missing.message
+    (tmp_path / "text.npz").write_text("no dump")
+    assert "is not a NaN dump" in run("viz_nan", str(tmp_path / "text.npz")).message
+    with pytest.raises(UserError, match="--port is 0"):
+        run_viz_nan(str(dump_file), VizNanConfig(port=0))
+
+
+def test_a_model_that_is_missing_damaged_or_another_is_told(dump_file: Path) -> None:
+    model_file = load_dump(str(dump_file))[0].model_file
+    content = model_file.read_bytes()
+    other = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
+    mujoco.mj_saveModel(other, str(model_file))
+    with pytest.raises(UserError, match="not of the same simulation"):
+        load_dump(str(dump_file))
+    model_file.write_bytes(content[:100])
+    with pytest.raises(UserError, match="cannot be read by MuJoCo"):
+        load_dump(str(dump_file))
+    model_file.unlink()
+    with pytest.raises(UserError, match=r"needs its model, model_.*\.mjb"):
+        load_dump(str(dump_file))
+
+
+def test_a_dump_without_states_is_told(tmp_path: Path) -> None:
+    metadata = json.dumps({"model_file": "m.mjb"})
+    np.savez(tmp_path / "empty.npz", _metadata=np.array(metadata))
+    with pytest.raises(UserError, match="holds no states"):
+        load_dump(str(tmp_path / "empty.npz"))
+
+
+def test_help_comes_without_building_anything() -> None:
+    code = (
+        "import sys; sys.argv = ['viz-nan', '--help']\n"
+        "from mjlab.scripts.viz_nan import main\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert end.code == 0\n"
+        "assert not {'torch', 'mujoco', 'tyro', 'viser'} & set(sys.modules)"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "nan_dump_latest.npz" in told.stdout
