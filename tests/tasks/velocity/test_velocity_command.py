@@ -386,8 +386,8 @@ def test_sliders_command_the_environment_in_view_while_they_are_enabled():
     gui, changes = FakeGui(), []
     term.create_gui("twist", SimpleNamespace(gui=gui), lambda: 3, lambda: changes.append(1))
     drawn = term.command.clone()
-    gui.items["lin_vel_x"].value = -0.5
-    gui.items["ang_vel_z"].value = 0.25
+    gui.items["Forward (m/s)"].value = -0.5
+    gui.items["Turn left (rad/s)"].value = 0.25
     term.compute(0.02)
     assert torch.equal(term.command, drawn)
     gui.items["Enable"].value = True
@@ -401,13 +401,27 @@ def test_sliders_command_the_environment_in_view_while_they_are_enabled():
     assert term.command[3].tolist() == [0.0, 0.0, 0.0]
     gui.items["Enable"].calls[0](None)
     assert changes == [1]
+    # Below the sliders the drawn command has gone on.
+    gui.items["Enable"].value = False
+    term.compute(0.02)
+    assert torch.equal(term.command, drawn)
+    # A command that is drawn anew at a reset is not the one that was replaced before.
+    gui.items["Enable"].value = True
+    term.compute(0.02)
+    term.reset(torch.tensor([3]))
+    redrawn = term.command[3].clone()
+    term.compute(0.0)
+    gui.items["Enable"].value = False
+    term.compute(0.02)
+    assert torch.equal(term.command[3], redrawn)
+    assert not torch.equal(redrawn, drawn[3])
 
 
 def test_a_smaller_maximum_pulls_its_slider_in():
     _, term = started()
     gui = FakeGui()
     term.create_gui("twist", SimpleNamespace(gui=gui), lambda: 0)
-    slider, maximum = gui.items["lin_vel_x"], gui.items["Max lin_vel_x"]
+    slider, maximum = gui.items["Forward (m/s)"], gui.items["Max forward (m/s)"]
     # Up to the larger end of the range, which is (-2, 1).
     assert (slider.min, slider.max) == (-2.0, 2.0)
     slider.value, maximum.value = 1.5, 0.5

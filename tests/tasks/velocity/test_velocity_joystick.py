@@ -82,8 +82,8 @@ def test_it_commands_the_environment_in_view_and_no_other_once_it_is_enabled(pag
     joystick.write_to(command)
     assert (command == 0.25).all()
     page.widgets["Enable"].set_by_person(True)
-    page.widgets["lin_vel_x"].set_by_person(1.5)
-    page.widgets["ang_vel_z"].set_by_person(-0.05)
+    page.widgets["Forward (m/s)"].set_by_person(1.5)
+    page.widgets["Turn left (rad/s)"].set_by_person(-0.05)
     joystick.write_to(command)
     assert command.tolist()[1] == pytest.approx([1.5, 0.0, -0.05])
     assert (command[[0, 2]] == 0.25).all()
@@ -91,7 +91,7 @@ def test_it_commands_the_environment_in_view_and_no_other_once_it_is_enabled(pag
 
 def test_moving_a_slider_takes_the_helm(page):
     joystick, changes = make(page, env_idx=0)
-    page.widgets["lin_vel_x"].set_by_person(0.5)
+    page.widgets["Forward (m/s)"].set_by_person(0.5)
     assert page.widgets["Enable"].value
     command = torch.zeros(1, 3)
     joystick.write_to(command)
@@ -101,7 +101,7 @@ def test_moving_a_slider_takes_the_helm(page):
 
 def test_zero_stops_the_robot(page):
     joystick, _ = make(page, env_idx=0)
-    for name, value in (("lin_vel_x", 0.5), ("lin_vel_y", 0.5), ("ang_vel_z", 0.05)):
+    for name, value in (("Forward (m/s)", 0.5), ("Left (m/s)", 0.5), ("Turn left (rad/s)", 0.05)):
         page.widgets[name].set_by_person(value)
     page.widgets["Zero"].set_by_person()
     command = torch.ones(1, 3)
@@ -111,12 +111,12 @@ def test_zero_stops_the_robot(page):
 
 def test_sliders_reach_the_ends_of_the_range_and_as_far_as_max_says(page):
     make(page)
-    forward = page.widgets["lin_vel_x"]
+    forward = page.widgets["Forward (m/s)"]
     assert (forward.min, forward.max) == (-2.0, 2.0)
     # An empty range still gives a slider that can be moved.
-    assert page.widgets["ang_vel_z"].max > 0.0
+    assert page.widgets["Turn left (rad/s)"].max > 0.0
     forward.set_by_person(1.75)
-    page.widgets["Max lin_vel_x"].set_by_person(1.0)
+    page.widgets["Max forward (m/s)"].set_by_person(1.0)
     assert (forward.min, forward.max, forward.value) == (-1.0, 1.0, 1.0)
 
 
@@ -126,3 +126,21 @@ def test_a_view_of_no_environment_commands_none(page):
     command = torch.ones(2, 3)
     joystick.write_to(command)
     assert (command == 1.0).all()
+
+
+def test_who_lets_go_finds_the_command_as_it_went_on_below(page):
+    joystick, _ = make(page, env_idx=1)
+    command = torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+    drawn = command.clone()
+    page.widgets["Enable"].set_by_person(True)
+    page.widgets["Forward (m/s)"].set_by_person(1.5)
+    for _ in range(2):
+        joystick.let_go(command)
+        assert torch.equal(command, drawn)
+        command[1, 2] = drawn[1, 2] = 0.7  # As heading control does at every step.
+        joystick.write_to(command)
+        assert command[1, 0] == 1.5
+    page.widgets["Enable"].set_by_person(False)
+    joystick.let_go(command)
+    joystick.write_to(command)
+    assert torch.equal(command, drawn)

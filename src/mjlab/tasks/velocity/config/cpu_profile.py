@@ -4,8 +4,8 @@ A few cores step some ten thousand environments a second, a hundredth of a GPU. 
 settings a robot has not left its first idea by then, which is to stand still: trying to move costs
 more penalty than it earns. So the profile makes the task easier to learn, not easier to pass:
 
-- Penalties start at a fraction of their weight and grow to it; a reward for feet in the air, which
-  the task has but does not weigh, fades out meanwhile.
+- Penalties start at a fraction of their weight and grow to it, and so do pushes; a reward for feet in
+  the air, which the task has but does not weigh, fades out meanwhile.
 - Contacts have no rolling and torsional friction, and a pyramidal friction cone. The solver then
   takes half the time.
 - Batches and networks are small, a policy may change more in an iteration, and rewards far away count
@@ -18,15 +18,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from mjlab.envs import ManagerBasedRlEnvCfg
+import torch
+
+from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.envs import mdp as envs_mdp
 from mjlab.managers.curriculum_manager import CurriculumTermCfg
 from mjlab.rl.config import RslRlOnPolicyRunnerCfg
 
+_PUSH, _EASED_PUSH = "push_robot", "eased_push_robot"
 _NUM_ENVS = 512
 _PENALTY_AT_FIRST = 0.02
 _AIR_TIME_AT_FIRST = 0.5
 _EASED_SAMPLES = 6_000_000
+_UNPUSHED_SAMPLES = 2_000_000
 _NUM_STAGES = 60
 
 
@@ -36,10 +40,12 @@ def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     rl_cfg.evaluation.prepare_env = _undoing(env_cfg)
     _simplify_contacts(env_cfg)
     _ease_rewards(env_cfg)
+    _ease_pushes(env_cfg)
     _learn_from_few_samples(rl_cfg)
     evaluation = rl_cfg.evaluation
     evaluation.num_episodes = 200
-    evaluation.min_interval = 20
+    evaluation.trigger_return = 3600.0
+    evaluation.min_interval = 25
     evaluation.solved_below = {"lin_vel_error": 0.25, "ang_vel_error": 0.35, "failure_rate": 0.05}
 
 
@@ -73,6 +79,33 @@ def _change_weight(env_cfg: ManagerBasedRlEnvCfg, name: str, first: float, last:
     )
 
 
+def _ease_pushes(env_cfg: ManagerBasedRlEnvCfg) -> None:
+    push = env_cfg.events.get(_PUSH)
+    if push is not None:
+        params = {"event_name": _PUSH, "velocity_range": push.params["velocity_range"]}
+        params["steps"] = _UNPUSHED_SAMPLES // _NUM_ENVS
+        env_cfg.curriculum[_EASED_PUSH] = CurriculumTermCfg(func=growing_pushes, params=params)
+
+
+def growing_pushes(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor | slice,
+    event_name: str,
+    velocity_range: dict[str, tuple[float, float]],
+    steps: int,
+) -> float:
+    """Let pushes grow from nothing to `velocity_range` over `steps` environment steps.
+
+    Returns the fraction that they have reached, for logging.
+    """
+    fraction = min(env.common_step_counter / steps, 1.0)
+    params = env.event_manager.get_term_cfg(event_name).params
+    params["velocity_range"] = {
+        axis: (fraction * low, fraction * high) for axis, (low, high) in velocity_range.items()
+    }
+    return fraction
+
+
 def _undoing(env_cfg: ManagerBasedRlEnvCfg) -> Callable[[ManagerBasedRlEnvCfg], None]:
     """Return what makes an environment config that the profile eased as hard as `env_cfg` is now."""
     cone = env_cfg.sim.mujoco.cone
@@ -86,6 +119,7 @@ def _undoing(env_cfg: ManagerBasedRlEnvCfg) -> Callable[[ManagerBasedRlEnvCfg], 
         for name, weight in weights.items():
             if eased.curriculum.pop(f"eased_{name}", None) is not None:
                 eased.rewards[name].weight = weight
+        eased.curriculum.pop(_EASED_PUSH, None)
 
     return undo_easing
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from mjlab.sensor import BuiltinSensor, ContactSensor, TerrainHeightSensor
+from mjlab.utils.string import name_list
 
 if TYPE_CHECKING:
     import mujoco
@@ -18,12 +19,12 @@ S = TypeVar("S")
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return what to say about the names that exist: the nearest ones, or all."""
+    """Return what to say about the names that exist: the nearest ones, or all if they are few."""
     names = list(known)
     close = difflib.get_close_matches(name, names)
     if close:
         return f"Did you mean {' or '.join(map(repr, close))}?"
-    return f"There are: {names}."
+    return f"There are: {name_list(names, near=())}."
 
 
 def require_sensor(env: ManagerBasedRlEnv, name: str, kind: type[S]) -> S:
@@ -35,7 +36,10 @@ def require_sensor(env: ManagerBasedRlEnv, name: str, kind: type[S]) -> S:
     """
     sensors = env.scene.sensors
     if name not in sensors:
-        raise ValueError(f"The scene has no sensor {name!r}. {nearest(name, sensors)}")
+        # A contact sensor is made of MuJoCo's own, one for each of its parts, that nobody asks for.
+        contacts = tuple(f"{n}_" for n, s in sensors.items() if isinstance(s, ContactSensor))
+        known = [n for n in sensors if not n.startswith(contacts)]
+        raise ValueError(f"The scene has no sensor {name!r}. {nearest(name, known)}")
     sensor: Any = sensors[name]
     if not isinstance(sensor, kind):
         same_kind = [other for other, s in sensors.items() if isinstance(s, kind)]

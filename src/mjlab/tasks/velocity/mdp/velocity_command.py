@@ -169,9 +169,13 @@ class UniformVelocityCommand(CommandTerm):
         one after a reset does, is no sample of the error.
         """
         self._add_sample(dt, env_ids)
+        if self._joystick is None:
+            super().compute(dt, env_ids)
+            return
+        # Below the joystick the command goes on as drawn, so that it is there when that lets go.
+        self._joystick.let_go(self.vel_command_b)
         super().compute(dt, env_ids)
-        if self._joystick is not None:
-            self._joystick.write_to(self.vel_command_b)
+        self._joystick.write_to(self.vel_command_b)
 
     def reset(self, env_ids: torch.Tensor | slice | None) -> dict[str, float]:
         """Draw new commands in these environments; return the mean errors of their episodes.
@@ -182,6 +186,8 @@ class UniformVelocityCommand(CommandTerm):
         ids = as_ids(env_ids, self.num_envs, self.device)
         if is_empty(ids):
             return {}
+        if self._joystick is not None:
+            self._joystick.let_go(self.vel_command_b)
         never_stepped = self._samples[ids] == 0.0
         for values in self.metrics.values():
             values[ids] = values[ids].masked_fill_(never_stepped, torch.nan)

@@ -12,7 +12,12 @@ if TYPE_CHECKING:
 
 _STEP = 0.05
 _MAX_BOUNDS = (0.1, 10.0)
-_COMPONENTS = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
+# Ranges of the command, and what a person calls them.
+_COMPONENTS = {
+    "lin_vel_x": "Forward (m/s)",
+    "lin_vel_y": "Left (m/s)",
+    "ang_vel_z": "Turn left (rad/s)",
+}
 
 
 class VelocityJoystick:
@@ -38,6 +43,7 @@ class VelocityJoystick:
         self._get_env_idx = get_env_idx
         self._on_change = on_change
         self._sliders: list[Any] = []
+        self._replaced: tuple[int, torch.Tensor] | None = None
         with server.gui.add_folder(name.capitalize()):
             self._enabled = server.gui.add_checkbox(
                 "Enable",
@@ -54,8 +60,9 @@ class VelocityJoystick:
         low, high = _MAX_BOUNDS
         # A range may be negative or empty, and a slider may not.
         limit = min(max(abs(bound) for bound in (*getattr(ranges, component), low)), high)
-        slider = server.gui.add_slider(component, -limit, limit, _STEP, 0.0)
-        maximum = server.gui.add_slider(f"Max {component}", low, high, 0.1, limit)
+        label = _COMPONENTS[component]
+        slider = server.gui.add_slider(label, -limit, limit, _STEP, 0.0)
+        maximum = server.gui.add_slider(f"Max {label[0].lower()}{label[1:]}", low, high, 0.1, limit)
         slider.on_update(self._moved)
 
         @maximum.on_update
@@ -65,10 +72,18 @@ class VelocityJoystick:
 
         return slider
 
+    def let_go(self, command: torch.Tensor) -> None:
+        """Put the row of (N, 3) commands back that was overwritten last, if one was."""
+        if self._replaced is not None:
+            index, row = self._replaced
+            command[index] = row
+            self._replaced = None
+
     def write_to(self, command: torch.Tensor) -> None:
         """Overwrite the row of the environment in view of (N, 3) commands, if enabled."""
         index = self._get_env_idx()
         if self._enabled.value and 0 <= index < len(command):
+            self._replaced = index, command[index].clone()
             values = [float(slider.value) for slider in self._sliders]
             command[index] = torch.tensor(values, dtype=command.dtype, device=command.device)
 
