@@ -17,35 +17,13 @@ from public_interface import Entry, command_line, entries, problems
 
 # What is not built yet: modules by their beginning, and names of modules that are there.
 LATER_MODULES = (
-    "mjlab.asset_zoo.robots.i2rt_yam",
-    "mjlab.entity.variants",
-    "mjlab.envs.mdp.actions.differential_ik",
-    "mjlab.sensor.camera_sensor",
-    "mjlab.tasks.manipulation",
-    "mjlab.tasks.tracking",
 )
 LATER_NAMES = {
-    "mjlab.asset_zoo.robots": "get_yam_robot_cfg",
-    "mjlab.entity": "VariantEntityCfg VariantMetadata",
-    "mjlab.envs.mdp": "DifferentialIKAction DifferentialIKActionCfg",
-    "mjlab.envs.mdp.actions": "DifferentialIKAction DifferentialIKActionCfg",
-    "mjlab.sensor": "CameraSensor CameraSensorCfg CameraSensorData",
-    "mjlab.tasks.velocity.mdp": "DifferentialIKAction DifferentialIKActionCfg",
 }
 LATER = {
     f"{module}.exports": {f"{name} is not exported" for name in names.split()}
     for module, names in LATER_NAMES.items()
 } | {
-    # Images, which come with the camera sensor.
-    "mjlab.sensor.sensor_context.SensorContext": {
-        "method get_depth is missing",
-        "method get_rgb is missing",
-        "method get_segmentation is missing",
-        "method unpack_rgb is missing",
-        "property render_context is missing",
-    },
-    # Variants of an entity within one simulation.
-    "mjlab.sim.sim.VARIANT_DEPENDENT_FIELDS": {"is missing"},
 }
 
 # What is otherwise on purpose.
@@ -63,11 +41,11 @@ DEVIATIONS = {
 # Flags of 1.6 that are not there: the reason is said once for each.
 MISSING_FLAGS = {
     "mjlab.scripts.train.TrainConfig": {
-        # Of motion tracking, which will bring its own way to name a motion.
+        # Of motion tracking, which brings it itself: see `mjlab.tasks.options`.
         "registry_name",
     },
     "mjlab.scripts.play.PlayConfig": {
-        # Of motion tracking, and of the demo.
+        # Of motion tracking, which brings them itself, and of the demo.
         "registry_name",
         "motion_file",
         "_demo_mode",

@@ -19,7 +19,8 @@ _COMMAND = re.compile(r"\buv run (?:--\S+ )*([\w-]+)")
 _FLAG = re.compile(r"(?<![\w-])--([a-z][\w.-]*[a-z])")
 _OBJECT = re.compile(r"^\.\. auto\w+:: (\S+)$", re.MULTILINE)
 _COMMAND_LINE = re.compile(
-    r"\b(train-seeds|train|demo|play|evaluate|profile-env|export-scene|viz-nan|visualize_terrain)"
+    r"\b(train-seeds|train|demo|play|evaluate|profile-env|export-scene|viz-nan|visualize_terrain"
+    r"|csv_to_npz)"
     r"((?: [^\s`#]+)*)"
 )
 _MAKE = re.compile(r"\bmake ([a-z-]+)")
@@ -53,6 +54,7 @@ def test_make_targets_exist(page: Path) -> None:
 @cache
 def _flags_of() -> dict[str, list[object]]:
     """Each command's flags: configs, whose fields they are, and sets of names."""
+    from mjlab.scripts.csv_to_npz import CsvToNpzConfig
     from mjlab.scripts.evaluate import EvaluateConfig
     from mjlab.scripts.export_scene import ExportSceneConfig
     from mjlab.scripts.play import PlayConfig
@@ -60,15 +62,18 @@ def _flags_of() -> dict[str, list[object]]:
     from mjlab.scripts.train import TrainConfig
     from mjlab.scripts.visualize_terrain import VisualizeTerrainConfig
     from mjlab.scripts.viz_nan import VizNanConfig
+    from mjlab.tasks.tracking.options import MotionOptions
 
     train = TrainConfig.from_task("Mjlab-Cartpole-Swingup")
     play = PlayConfig(env=train.env)
     return {
-        "train": [train],
+        # With the flags that motion tracking brings itself.
+        "train": [train, MotionOptions()],
         "train-seeds": [train, {"seeds": None}],
         "demo": [play],
-        "play": [play],
-        "evaluate": [EvaluateConfig(env=train.env)],
+        "play": [play, MotionOptions()],
+        "evaluate": [EvaluateConfig(env=train.env), MotionOptions()],
+        "csv_to_npz": [CsvToNpzConfig()],
         "profile-env": [ProfileConfig(env=train.env)],
         "export-scene": [ExportSceneConfig()],
         "visualize_terrain": [VisualizeTerrainConfig()],

@@ -128,6 +128,26 @@ def test_resuming_keeps_the_profile(run, profiled):
     assert "actor" in outcome.message
 
 
+@pytest.mark.parametrize(
+    ("variables", "tells"),
+    [
+        ({}, True),
+        ({"RANK": "0", "WORLD_SIZE": "2"}, True),
+        ({"RANK": "1", "WORLD_SIZE": "2"}, False),
+        ({"RANK": "0", "WORLD_SIZE": "2", "MJLAB_PROCESS_STORE": "127.0.0.1:1"}, False),
+    ],
+)
+def test_of_several_processes_one_tells_which_profile_is_resumed(
+    profiled, monkeypatch, capsys, variables, tells
+):
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    flags = ["--agent.resume", "True", "--log-root", str(profiled.parents[1])]
+    assert parse_train_flags(PROFILED, flags, "train").profile == "cpu"
+    output = capsys.readouterr()
+    assert ("Resuming with the profile" in output.err + output.out) == tells
+
+
 def test_play_and_evaluate_find_the_profile_of_the_run(run, profiled):
     common = ("--log-root", str(profiled.parents[1]), "--device", "cpu")
     named = ("--checkpoint-file", str(profiled / "model_0.pt"))

@@ -39,6 +39,48 @@ for task, positions in {
         f"{ {'_': 'EvaluationCfg', 'metrics': _TRACKING_ERRORS}!r} here"
     }
 
+_PLACEMENT = {
+    "metrics": {n: f"tasks.manipulation.success:{n}" for n in ("position_error", "at_goal")},
+    "success_func": "tasks.manipulation.success:placed_at_goal",
+}
+for task in (
+    "Mjlab-Lift-Cube-Yam",
+    "Mjlab-Lift-Cube-Yam-Rgb",
+    "Mjlab-Lift-Cube-Yam-Depth",
+    "Mjlab-Multi-Cube-Seg-Yam",
+):
+    DEVIATIONS[task] = {
+        "env.scene.sensors[0].reduce is 'none' in the table, and default here",
+        "rl.evaluation is default in the table, and "
+        f"{ {'_': 'EvaluationCfg', **_PLACEMENT}!r} here",
+    }
+# Motion tracking works without naming a motion, ends episodes where the motion does, and plays without
+# noise in the joints. What evaluations measure, and how, is ours.
+_MOTION_ERRORS = {
+    name: f"tasks.tracking.evaluation:{name}"
+    for name in ("mpkpe", "r_mpkpe", "joint_vel_error", "ee_pos_error", "ee_ori_error")
+}
+_MOTION_ENDED = {
+    "_": "TerminationTermCfg",
+    "func": "tasks.tracking.mdp.terminations:motion_ended",
+    "params": {"command_name": "motion"},
+    "time_out": True,
+}
+_MOTION_EVALUATION = {
+    "_": "EvaluationCfg",
+    "metrics": _MOTION_ERRORS,
+    "success_is_survival": True,
+    "prepare_env": "tasks.tracking.evaluation:play_motions_once",
+}
+for variant in ("", "-No-State-Estimation"):
+    DEVIATIONS[f"Mjlab-Tracking-Flat-Unitree-G1{variant}"] = {
+        "env.scene.sensors[0].reduce is 'none' in the table, and default here",
+        "env.commands.motion.motion_file is '' in the table, 'squat,wave' here",
+        f"env.terminations.motion_ended is default in the table, and {_MOTION_ENDED!r} here",
+        f"rl.evaluation is default in the table, and {_MOTION_EVALUATION!r} here",
+        "play: commands.motion.joint_position_range is [-0.1, 0.1] in training, [0.0, 0.0] in play",
+    }
+
 
 @pytest.mark.parametrize("task", TABLES)
 def test_the_task_has_the_figures_of_its_table(task):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ from mjlab.scripts.cli import UserError, tell
 from mjlab.scripts.profiles import profile_of_run
 from mjlab.scripts.run_folder import read_env_params, read_run_info, run_folders
 from mjlab.tasks.registry import load_env_cfg
+from mjlab.utils.processes import process_rank
 
 if TYPE_CHECKING:
     from mjlab.rl import MjlabOnPolicyRunner
@@ -61,9 +63,19 @@ def profile_to_resume(task: str, cfg: TrainConfig) -> str | None:
         # It is told when training is to start, after what else may be wrong with the flags.
         return None
     profile = None if checkpoint is None else profile_of_run(task, checkpoint.parent)
-    if profile is not None:
+    if profile is not None and _speaks_for_the_run():
         tell(f"Resuming with the profile {profile!r}, as before; --profile gives another.")
     return profile
+
+
+def _speaks_for_the_run() -> bool:
+    """Return whether what concerns all processes of a run is for this one to tell.
+
+    All of them read the flags. Our launcher has told it before it started the others.
+    """
+    from mjlab.rl.distributed import STORE_VARIABLE
+
+    return STORE_VARIABLE not in os.environ and process_rank().is_first
 
 
 def keep_number_of_environments(task: str, cfg: TrainConfig, checkpoint: Path) -> None:

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
     from mjlab.rl.config import RslRlBaseRunnerCfg
+    from mjlab.tasks.options import TaskOptions
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +53,7 @@ class _Task:
     rl_cfg: Any
     runner_cls: Any
     profiles: dict[str, Any]
+    options: Any
 
 
 _tasks: dict[str, _Task] = {}
@@ -65,6 +67,7 @@ def register_mjlab_task(
     rl_cfg: RslRlBaseRunnerCfg | Callable[[], RslRlBaseRunnerCfg] | str | None = None,
     runner_cls: type | str | None = None,
     profiles: Mapping[str, Callable[[Any, Any], None] | str] | None = None,
+    options: type[TaskOptions] | str | None = None,
 ) -> None:
     """Register a task under `task_id`.
 
@@ -81,6 +84,8 @@ def register_mjlab_task(
             `module:function`, that edits copies of the task's configs in place. Flags of the
             command line come after it and win. It may not change `rl_cfg.experiment_name`, by
             which runs of the task are found.
+        options: a dataclass of further command-line flags, which also gets what the task needs
+            before it is built (see `mjlab.tasks.options`), or its name as `module:Class`.
 
     Raises:
         ValueError: the name is taken, `rl_cfg` is missing, or a profile's name is no single word.
@@ -95,7 +100,9 @@ def register_mjlab_task(
                 f"Task {task_id!r} has a profile named {profile!r}; a name is one word of letters, "
                 "digits, '-' and '_', such as 'cpu', and not 'None'."
             )
-    _tasks[task_id] = _Task(env_cfg, play_env_cfg, rl_cfg, runner_cls, dict(profiles or {}))
+    _tasks[task_id] = _Task(
+        env_cfg, play_env_cfg, rl_cfg, runner_cls, dict(profiles or {}), options
+    )
 
 
 def list_tasks() -> list[str]:
@@ -183,6 +190,12 @@ def load_runner_cls(task_name: str) -> type | None:
     """Return the runner class of a task, or None for the default one; raises likewise."""
     runner_cls = _find(task_name).runner_cls
     return _imported(task_name, runner_cls) if isinstance(runner_cls, str) else runner_cls
+
+
+def load_options_cls(task_name: str) -> type[TaskOptions] | None:
+    """Return the class of a task's own options, or None if it has none; raises likewise."""
+    options = _find(task_name).options
+    return _imported(task_name, options) if isinstance(options, str) else options
 
 
 def require_task(task_name: str) -> None:

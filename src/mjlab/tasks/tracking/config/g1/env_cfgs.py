@@ -1,0 +1,118 @@
+"""Motion tracking by the Unitree G1."""
+
+from __future__ import annotations
+
+from mjlab.asset_zoo.robots import get_g1_robot_cfg
+from mjlab.asset_zoo.robots.unitree_g1.g1_constants import G1_ACTION_SCALE
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.sensor import ContactMatch, ContactSensorCfg
+from mjlab.tasks.tracking import mdp
+from mjlab.tasks.tracking.tracking_env_cfg import make_tracking_env_cfg
+
+MOTIONS = "squat,wave"
+"""What is imitated unless another motion is named: motions that ship with the package."""
+
+_TORSO = "torso_link"
+_BODIES = (
+    "pelvis",
+    "left_hip_roll_link",
+    "left_knee_link",
+    "left_ankle_roll_link",
+    "right_hip_roll_link",
+    "right_knee_link",
+    "right_ankle_roll_link",
+    _TORSO,
+    "left_shoulder_roll_link",
+    "left_elbow_link",
+    "left_wrist_yaw_link",
+    "right_shoulder_roll_link",
+    "right_elbow_link",
+    "right_wrist_yaw_link",
+)
+_END_EFFECTORS = (
+    "left_ankle_roll_link",
+    "right_ankle_roll_link",
+    "left_wrist_yaw_link",
+    "right_wrist_yaw_link",
+)
+_FOOT_GEOMS = r"^(left|right)_foot[1-7]_collision$"
+
+
+def unitree_g1_flat_tracking_env_cfg(
+    has_state_estimation: bool = True, play: bool = False
+) -> ManagerBasedRlEnvCfg:
+    """Return the task, to train or to `play` with.
+
+    Args:
+        has_state_estimation: Whether the policy knows its own velocity and where the reference is,
+            which a robot has to estimate.
+        play: Start at the first frame and as the motion does, without noise and pushes.
+    """
+    cfg = make_tracking_env_cfg()
+    cfg.scene.entities = {"robot": get_g1_robot_cfg()}
+    itself = ContactMatch(mode="subtree", pattern="pelvis", entity="robot")
+    cfg.scene.sensors += (
+        ContactSensorCfg(
+            name="self_collision",
+            primary=itself,
+            secondary=itself,
+            fields=("found", "force"),
+            reduce="maxforce",
+            num_slots=1,
+            history_length=4,
+        ),
+    )
+    joint_pos = cfg.actions["joint_pos"]
+    assert isinstance(joint_pos, mdp.JointPositionActionCfg)
+    joint_pos.scale = dict(G1_ACTION_SCALE)
+    motion = _motion(cfg)
+    motion.motion_file = MOTIONS
+    motion.anchor_body_name = _TORSO
+    motion.body_names = _BODIES
+    _set_names(cfg)
+    if not has_state_estimation:
+        actor = cfg.observations["actor"]
+        assert actor is not None
+        actor.terms.pop("motion_anchor_pos_b")
+        actor.terms.pop("base_lin_vel")
+    if play:
+        _make_playable(cfg)
+    return cfg
+
+
+def unitree_g1_flat_tracking_no_state_estimation_env_cfg(
+    play: bool = False,
+) -> ManagerBasedRlEnvCfg:
+    """Return the task for a robot that estimates neither its velocity nor its position."""
+    return unitree_g1_flat_tracking_env_cfg(has_state_estimation=False, play=play)
+
+
+def _motion(cfg: ManagerBasedRlEnvCfg) -> mdp.MotionCommandCfg:
+    motion = cfg.commands["motion"]
+    assert isinstance(motion, mdp.MotionCommandCfg)
+    return motion
+
+
+def _set_names(cfg: ManagerBasedRlEnvCfg) -> None:
+    friction, base_com = cfg.events["foot_friction"], cfg.events["base_com"]
+    end_effectors = cfg.terminations["ee_body_pos"]
+    assert friction is not None
+    assert base_com is not None
+    assert end_effectors is not None
+    friction.params["asset_cfg"].geom_names = _FOOT_GEOMS
+    base_com.params["asset_cfg"].body_names = (_TORSO,)
+    end_effectors.params["body_names"] = _END_EFFECTORS
+    cfg.viewer.body_name = _TORSO
+
+
+def _make_playable(cfg: ManagerBasedRlEnvCfg) -> None:
+    cfg.episode_length_s = int(1e9)
+    actor = cfg.observations["actor"]
+    assert actor is not None
+    actor.enable_corruption = False
+    cfg.events.pop("push_robot")
+    motion = _motion(cfg)
+    motion.pose_range = {}
+    motion.velocity_range = {}
+    motion.joint_position_range = (0.0, 0.0)
+    motion.sampling_mode = "start"

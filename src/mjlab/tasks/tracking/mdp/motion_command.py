@@ -1,0 +1,336 @@
+"""The motion command: where the robot should be now, and starting it there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+
+from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
+from mjlab.managers.env_ids import as_ids, is_empty
+from mjlab.tasks.tracking.mdp.command_checks import check_command_cfg, find_robot, read_library
+from mjlab.tasks.tracking.mdp.motion_drawing import MotionDrawing
+from mjlab.tasks.tracking.mdp.motion_panel import MotionPanel
+from mjlab.tasks.tracking.mdp.motion_reader import MotionFrame, MotionReader
+from mjlab.tasks.tracking.mdp.motion_sampling import Drawn, HardSegmentSampler, draw_uniform
+from mjlab.tasks.tracking.mdp.perturbed_start import perturbed_start
+from mjlab.tasks.tracking.mdp.tracking_metrics import tracking_metrics
+
+if TYPE_CHECKING:
+    import viser
+
+    from mjlab.entity import Entity
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.viewer.debug_visualizer import DebugVisualizer
+
+_SAMPLING_METRICS = ("sampling_entropy", "sampling_top1_prob", "sampling_top1_bin")
+
+
+@dataclass(kw_only=True)
+class MotionCommandCfg(CommandTermCfg):
+    """Motions to imitate."""
+
+    @dataclass
+    class VizCfg:
+        """How the reference is drawn."""
+
+        mode: Literal["ghost", "frames"] = "ghost"
+        """`ghost` draws a see-through robot, `frames` the axes of each tracked body, of the
+        reference (short) and of the robot (long)."""
+        ghost_color: tuple[float, float, float, float] = (0.5, 0.7, 0.5, 0.5)
+        """Red, green, blue and opacity of the ghost."""
+        ghost_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        """From the place of the reference to that of the ghost, in metres: zero is over the robot,
+        (0, 1, 0) beside it."""
+
+    motion_file: str
+    """The motions: files, folders, or names of motions that ship with the package, separated by
+    commas."""
+    anchor_body_name: str
+    """Body by which robot and reference are aligned; one of `body_names`."""
+    body_names: tuple[str, ...]
+    """Bodies to track; the first is the floating base."""
+    entity_name: str
+    """The robot."""
+    pose_range: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Perturbation of the root's pose at a start: ranges of `x`, `y`, `z` (m), `roll`, `pitch` and
+    `yaw` (rad, world axes); 0 where there is none."""
+    velocity_range: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Perturbation of the root's velocity, likewise (m/s, rad/s)."""
+    joint_position_range: tuple[float, float] = (-0.52, 0.52)
+    """Perturbation of each joint's position at a start (rad)."""
+    adaptive_kernel_size: int = 1
+    """Bins ahead of a start, its own included, whose failures make it more likely."""
+    adaptive_lambda: float = 0.8
+    """Weight of failures one bin further ahead."""
+    adaptive_uniform_ratio: float = 0.1
+    """Weight of starts anywhere, against failures."""
+    adaptive_alpha: float = 0.001
+    """Share of the running mean of failures that one step replaces."""
+    sampling_mode: Literal["adaptive", "uniform", "start"] = "adaptive"
+    """Where episodes start: `adaptive` more often where they fail, `uniform` anywhere, `start` at
+    the first frame, of one motion after the other."""
+    viz: VizCfg = field(default_factory=VizCfg)
+    """Drawing."""
+    advance_after_teleport: bool = True
+    """Whether the reference is a frame ahead of the robot after the end of a motion, as it is after
+    a reset; False is what mjlab 1.6 does. A motion is played to its end only where no termination
+    (`motion_ended`) ends the episode there."""
+
+    def build(self, env: ManagerBasedRlEnv) -> MotionCommand:
+        """Return the term; raises `ValueError` for motions or settings that do not fit the robot."""
+        return MotionCommand(self, env)
+
+
+class MotionCommand(MotionReader, CommandTerm):
+    """Plays motions as the reference, one frame a step, and starts the robot on them.
+
+    In a step, rewards and terminations compare the robot with frame t, which the policy saw. Then
+    environments that are done are reset: the robot is put, perturbed, onto a frame k. The update of
+    the command measures errors, advances t by one everywhere (the robot is at k then, and the
+    reference at k + 1), and refreshes the relative poses. Where the motion is over, the robot is put
+    onto another frame at once, in the middle of its episode, unless a termination such as
+    `motion_ended` has ended that.
+
+    The relative poses (`relative_poses`) are refreshed once a step and then kept, so that rewards
+    go by the robot's anchor of one step before.
+
+    Attributes:
+        motion: The motions; see `MotionLibrary`.
+        motion_files: Where they were read from.
+        motion_ids: (N,) int64, the motion of each environment.
+        time_steps: (N,) int64, its frame t within that motion.
+        body_pos_relative_w: (N, K, 3) relative positions; `body_quat_relative_w` (N, K, 4).
+        sampler: The statistics of failures; None unless sampling is adaptive.
+        drawing: How the reference is drawn.
+    """
+
+    cfg: MotionCommandCfg
+
+    # What the config and the files say, and what lasts no longer than a call.
+    _transient = {
+        "scene", "robot", "body_names", "body_indexes", "anchor_index", "anchor_body", "motion_files",
+        "_num_bins", "_moved",
+    }  # fmt: skip
+
+    def __init__(self, cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> None:
+        super().__init__(cfg, env)
+        check_command_cfg(cfg)
+        self.scene = env.scene
+        self.robot: Entity = find_robot(cfg, env.scene)
+        self.body_names = tuple(cfg.body_names)
+        self.anchor_index = self.body_names.index(cfg.anchor_body_name)
+        indexes = [self.robot.body_names.index(name) for name in self.body_names]
+        self.body_indexes = torch.tensor(indexes, device=self.device)
+        self.anchor_body = indexes[self.anchor_index]
+        self.motion_files, self.motion = read_library(
+            cfg.motion_file, self.robot, self.body_indexes, env.step_dt, self.device
+        )
+        self.time_steps = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+        self.motion_ids = torch.zeros_like(self.time_steps)
+        shape = (self.num_envs, len(indexes))
+        self.body_pos_relative_w = torch.zeros(*shape, 3, device=self.device)
+        self.body_quat_relative_w = torch.zeros(*shape, 4, device=self.device)
+        self.body_quat_relative_w[..., 0] = 1.0
+        self.metrics = {
+            name: torch.zeros(self.num_envs, device=self.device)
+            for name in (*tracking_metrics(self), *_SAMPLING_METRICS)
+        }
+        sampler = self._make_sampler()
+        self._num_bins = sampler.num_bins
+        self.sampler = sampler if cfg.sampling_mode == "adaptive" else None
+        # How often each environment was started, so that it plays one motion after the other.
+        self._num_starts = torch.zeros_like(self.time_steps)
+        # The step in which a failure was last counted, so that none is counted twice.
+        self._counted_at = torch.full_like(self.time_steps, -1)
+        self._moved: list[torch.Tensor] = []
+        self.drawing = MotionDrawing(self)
+        self._panel: MotionPanel | None = None
+
+    def _make_sampler(self) -> HardSegmentSampler:
+        cfg = self.cfg
+        return HardSegmentSampler(
+            self.motion.lengths.tolist(),
+            self._env.step_dt,
+            cfg.adaptive_kernel_size,
+            cfg.adaptive_lambda,
+            cfg.adaptive_uniform_ratio,
+            cfg.adaptive_alpha,
+            self.device,
+        )
+
+    @property
+    def command(self) -> torch.Tensor:
+        """Positions and velocities of all joints in the reference, (N, 2 nj)."""
+        return torch.cat((self.joint_pos, self.joint_vel), dim=1)
+
+    @property
+    def frame_indexes(self) -> torch.Tensor:
+        """(N,) int64, the frame of each environment, counted over all motions."""
+        return self._counted_over_all(self.time_steps)
+
+    @property
+    def matching_frame(self) -> MotionFrame:
+        """The reference at the time of the robot's state, with relative poses of now.
+
+        Between steps the command itself is a frame ahead of the robot: it is what comes next.
+        """
+        return MotionFrame(self, self._counted_over_all((self.time_steps - 1).clamp_(min=0)))
+
+    def _counted_over_all(self, frames: torch.Tensor) -> torch.Tensor:
+        return frames if len(self.motion) == 1 else frames + self.motion.starts[self.motion_ids]
+
+    def update_relative_body_poses(self) -> None:
+        """Refresh the relative poses from the reference and the robot as they are now."""
+        pos, quat = self.relative_poses()
+        self.body_pos_relative_w.copy_(pos)
+        self.body_quat_relative_w.copy_(quat)
+
+    # Starting.
+
+    def reset(self, env_ids: torch.Tensor | slice | None) -> dict[str, float]:
+        """Start these environments on a frame; return the metrics of the episodes that ended.
+
+        Writes the robot's state; what derives from it is stale until `sim.forward()`.
+        """
+        log = super().reset(as_ids(env_ids, self.num_envs, self.device))
+        # The environment runs forward after its resets.
+        self._moved.clear()
+        return log
+
+    def reset_to_frame(self, env_ids: torch.Tensor, frame: int) -> None:
+        """Put robots exactly onto a frame of their motions, and the reference with them.
+
+        Joints are clipped to their soft limits. What derives from the robot's state, and the
+        relative poses, are stale until `sim.forward()` and `update_relative_body_poses()`.
+
+        Args:
+            env_ids: (n,) int64.
+            frame: Counted within the motion of each environment; beyond the end is the last.
+        """
+        last = self.motion.lengths[self.motion_ids[env_ids]] - 1
+        self.time_steps[env_ids] = torch.full_like(last, max(frame, 0)).minimum(last)
+        self._write_start(env_ids, perturbed=False)
+
+    def _resample_command(self, env_ids: torch.Tensor) -> None:
+        self._count_failures(env_ids)
+        self.motion_ids[env_ids], self.time_steps[env_ids] = self._draw(env_ids)
+        self._write_start(env_ids, perturbed=True)
+        self._moved.append(env_ids)
+
+    def _draw(self, env_ids: torch.Tensor) -> Drawn:
+        """Return a motion and a frame for each environment."""
+        if self.cfg.sampling_mode == "start":
+            motions = (env_ids + self._num_starts[env_ids]) % len(self.motion)
+            self._num_starts[env_ids] += 1
+            return motions, torch.zeros_like(motions)
+        if self.sampler is None:
+            self._write_sampling_metrics(1.0, 1.0 / self._num_bins, 0.5)
+            return draw_uniform(self.motion, len(env_ids))
+        probabilities = self.sampler.probabilities()
+        self._write_sampling_metrics(*self.sampler.figures(probabilities))
+        return self.sampler.draw(self.motion, len(env_ids), probabilities)
+
+    def _write_sampling_metrics(self, *values: Any) -> None:
+        for name, value in zip(_SAMPLING_METRICS, values, strict=True):
+            self.metrics[name][:] = value
+
+    def _write_start(self, env_ids: torch.Tensor, perturbed: bool) -> None:
+        """Write the robot's state on its frame, and forget its targets, delays and histories."""
+        robot, cfg = self.robot, self.cfg
+        at = self.frame_indexes[env_ids]
+        root_state, joint_pos = perturbed_start(
+            self.motion,
+            at,
+            pose_range=cfg.pose_range if perturbed else {},
+            velocity_range=cfg.velocity_range if perturbed else {},
+            joint_position_range=cfg.joint_position_range if perturbed else (0.0, 0.0),
+        )
+        root_state[:, :3] += self.scene.env_origins[env_ids]
+        limits = robot.data.soft_joint_pos_limits[env_ids]
+        joint_pos = joint_pos.clamp(limits[..., 0], limits[..., 1])
+        robot.write_joint_state_to_sim(joint_pos, self.motion.joint_vel[at], env_ids=env_ids)
+        robot.write_root_state_to_sim(root_state, env_ids=env_ids)
+        robot.reset(env_ids)
+        robot.seed_position_targets(env_ids)
+
+    def _count_failures(self, env_ids: torch.Tensor) -> None:
+        """Count the environments that failed in this step, at the frame where they did.
+
+        The flags of a step stand until the next one, and environments may be reset again meanwhile.
+        """
+        terminations: Any = getattr(self._env, "termination_manager", None)
+        if self.sampler is None or terminations is None:
+            return
+        now = int(self._env.common_step_counter)
+        failed = terminations.terminated[env_ids] & (self._counted_at[env_ids] != now)
+        self._counted_at[env_ids] = now
+        ids = env_ids[failed]
+        if not is_empty(ids):
+            self.sampler.count_failures(self.motion, self.motion_ids[ids], self.time_steps[ids])
+
+    # The update of every step.
+
+    def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
+        """Measure errors, advance the reference by a frame, and refresh what depends on it.
+
+        The arguments are those of `CommandTerm.compute`. With `env_ids` None, which is once a step,
+        the failures of the step are taken into the statistics.
+        """
+        super().compute(dt, env_ids)
+        if self.sampler is not None and env_ids is None:
+            self.sampler.end_step()
+
+    def _update_metrics(self) -> None:
+        for name, value in tracking_metrics(self).items():
+            self.metrics[name].copy_(value)
+
+    def _update_command(self, env_ids: torch.Tensor | None) -> None:
+        self.time_steps[slice(None) if env_ids is None else env_ids] += 1
+        is_over = self.time_steps >= self.motion.lengths[self.motion_ids]
+        over = is_over.nonzero().flatten()
+        if not is_empty(over):
+            self._resample_command(over)
+            if self.cfg.advance_after_teleport:
+                self.time_steps[over] += 1
+        if self._moved:
+            # These robots were put elsewhere after the step's own forward.
+            self._env.sim.forward(torch.cat(self._moved).unique())
+            self._moved.clear()
+        self.update_relative_body_poses()
+
+    # Viewers.
+
+    def _debug_vis_impl(self, visualizer: DebugVisualizer) -> None:
+        if self._panel is not None:
+            self._panel.update()
+        self.drawing.draw(visualizer)
+
+    def create_gui(
+        self,
+        name: str,
+        server: viser.ViserServer,
+        get_env_idx: Callable[[], int],
+        on_change: Callable[[], None] | None = None,
+        request_action: Callable[[str, Any], None] | None = None,
+    ) -> None:
+        """Add the frame slider, the button that starts there, and the errors of the bodies."""
+        self._panel = MotionPanel(self, name, server, get_env_idx, on_change, request_action)
+
+    def on_viewer_pause(self, paused: bool) -> None:
+        """Let the frame slider move the reference while the viewer is paused."""
+        if self._panel is not None:
+            self._panel.set_paused(paused)
+
+    def apply_gui_reset(self, env_ids: torch.Tensor) -> bool:
+        """Put these environments exactly onto the frame that the panel asks for, if it does."""
+        chosen = None if self._panel is None else self._panel.take_start()
+        if chosen is None:
+            return False
+        self.motion_ids[env_ids], frame = chosen
+        self.reset_to_frame(env_ids, frame)
+        self._env.sim.forward()
+        self.update_relative_body_poses()
+        return True

@@ -1,0 +1,186 @@
+"""The reference beside the robot, under the names that errors are computed from."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from mjlab.utils.lab_api.math import quat_apply, quat_inv, quat_mul, yaw_quat
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+    from mjlab.scene import Scene
+    from mjlab.tasks.tracking.mdp.motion_loader import MotionLibrary
+
+
+class MotionReader:
+    """Reads a frame of the reference for each environment, and the robot as it is now.
+
+    N environments, K tracked bodies, nj joints. World frame, quaternions (w, x, y, z), SI units.
+    """
+
+    motion: MotionLibrary
+    robot: Entity
+    body_indexes: torch.Tensor
+    """(K,) int64, the tracked bodies, counted in the robot."""
+    anchor_index: int
+    """Which of the tracked bodies is the anchor."""
+    anchor_body: int
+    """The anchor, counted in the robot."""
+    body_names: tuple[str, ...]
+    """Names of the tracked bodies."""
+    scene: Scene
+    body_pos_relative_w: torch.Tensor
+    """(N, K, 3) relative positions, as of the last refresh; see `relative_poses`."""
+    body_quat_relative_w: torch.Tensor
+    """(N, K, 4) relative orientations, likewise."""
+
+    @property
+    def frame_indexes(self) -> torch.Tensor:
+        """(N,) int64, the frame of each environment, counted over all motions."""
+        raise NotImplementedError
+
+    # The reference.
+
+    @property
+    def joint_pos(self) -> torch.Tensor:
+        """(N, nj) joint positions of the reference."""
+        return self.motion.joint_pos[self.frame_indexes]
+
+    @property
+    def joint_vel(self) -> torch.Tensor:
+        """(N, nj) joint velocities of the reference."""
+        return self.motion.joint_vel[self.frame_indexes]
+
+    @property
+    def body_pos_w(self) -> torch.Tensor:
+        """(N, K, 3) positions of the tracked bodies in the reference."""
+        return self.motion.body_pos_w[self.frame_indexes].add_(self.scene.env_origins[:, None])
+
+    @property
+    def body_quat_w(self) -> torch.Tensor:
+        """(N, K, 4) orientations of the tracked bodies in the reference."""
+        return self.motion.body_quat_w[self.frame_indexes]
+
+    @property
+    def body_lin_vel_w(self) -> torch.Tensor:
+        """(N, K, 3) velocities of the tracked bodies' origins in the reference."""
+        return self.motion.body_lin_vel_w[self.frame_indexes]
+
+    @property
+    def body_ang_vel_w(self) -> torch.Tensor:
+        """(N, K, 3) angular velocities of the tracked bodies in the reference."""
+        return self.motion.body_ang_vel_w[self.frame_indexes]
+
+    @property
+    def anchor_pos_w(self) -> torch.Tensor:
+        """(N, 3) position of the anchor in the reference."""
+        place = self.motion.body_pos_w[self.frame_indexes, self.anchor_index]
+        return place.add_(self.scene.env_origins)
+
+    @property
+    def anchor_quat_w(self) -> torch.Tensor:
+        """(N, 4) orientation of the anchor in the reference."""
+        return self.motion.body_quat_w[self.frame_indexes, self.anchor_index]
+
+    @property
+    def anchor_lin_vel_w(self) -> torch.Tensor:
+        """(N, 3) velocity of the anchor's origin in the reference."""
+        return self.motion.body_lin_vel_w[self.frame_indexes, self.anchor_index]
+
+    @property
+    def anchor_ang_vel_w(self) -> torch.Tensor:
+        """(N, 3) angular velocity of the anchor in the reference."""
+        return self.motion.body_ang_vel_w[self.frame_indexes, self.anchor_index]
+
+    # The robot.
+
+    @property
+    def robot_joint_pos(self) -> torch.Tensor:
+        """(N, nj) joint positions of the robot."""
+        return self.robot.data.joint_pos
+
+    @property
+    def robot_joint_vel(self) -> torch.Tensor:
+        """(N, nj) joint velocities of the robot."""
+        return self.robot.data.joint_vel
+
+    @property
+    def robot_body_pos_w(self) -> torch.Tensor:
+        """(N, K, 3) positions of the tracked bodies of the robot."""
+        return self.robot.data.body_link_pos_w.index_select(1, self.body_indexes)
+
+    @property
+    def robot_body_quat_w(self) -> torch.Tensor:
+        """(N, K, 4) orientations of the tracked bodies of the robot."""
+        return self.robot.data.body_link_quat_w.index_select(1, self.body_indexes)
+
+    @property
+    def robot_body_lin_vel_w(self) -> torch.Tensor:
+        """(N, K, 3) velocities of the tracked bodies' origins."""
+        return self.robot.data.body_link_lin_vel_w.index_select(1, self.body_indexes)
+
+    @property
+    def robot_body_ang_vel_w(self) -> torch.Tensor:
+        """(N, K, 3) angular velocities of the tracked bodies."""
+        return self.robot.data.body_link_ang_vel_w.index_select(1, self.body_indexes)
+
+    @property
+    def robot_anchor_pos_w(self) -> torch.Tensor:
+        """(N, 3) position of the robot's anchor."""
+        return self.robot.data.body_link_pos_w[:, self.anchor_body]
+
+    @property
+    def robot_anchor_quat_w(self) -> torch.Tensor:
+        """(N, 4) orientation of the robot's anchor."""
+        return self.robot.data.body_link_quat_w[:, self.anchor_body]
+
+    @property
+    def robot_anchor_lin_vel_w(self) -> torch.Tensor:
+        """(N, 3) velocity of the origin of the robot's anchor."""
+        return self.robot_body_lin_vel_w[:, self.anchor_index]
+
+    @property
+    def robot_anchor_ang_vel_w(self) -> torch.Tensor:
+        """(N, 3) angular velocity of the robot's anchor."""
+        return self.robot_body_ang_vel_w[:, self.anchor_index]
+
+    def relative_poses(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the reference carried to the robot's x, y and heading, at its own height.
+
+        With anchors (p, q) of the reference and (p', q') of the robot, both as they are now, and D
+        the turn about z by the yaw of q' q^-1:
+
+            q_rel = D q_body,   p_rel = (p'_x, p'_y, p_z) + D (p_body - p).
+
+        Returns:
+            Positions (N, K, 3) and orientations (N, K, 4).
+        """
+        body_pos, body_quat = self.body_pos_w, self.body_quat_w
+        anchor_pos, anchor_quat = body_pos[:, self.anchor_index], body_quat[:, self.anchor_index]
+        turn = yaw_quat(quat_mul(self.robot_anchor_quat_w, quat_inv(anchor_quat)))
+        turn = turn[:, None].expand(-1, body_pos.shape[1], -1)
+        place = torch.cat((self.robot_anchor_pos_w[:, :2], anchor_pos[:, 2:]), dim=1)
+        pos = quat_apply(turn, body_pos - anchor_pos[:, None]).add_(place[:, None])
+        return pos, quat_mul(turn, body_quat)
+
+
+class MotionFrame(MotionReader):
+    """Other frames than the command's beside the robot as it is now.
+
+    Its relative poses are those of now, where the command keeps those of its last update.
+    """
+
+    def __init__(self, reader: MotionReader, frame_indexes: torch.Tensor) -> None:
+        """Take the frames (N,), counted over all motions, of what `reader` reads."""
+        self.motion, self.robot, self.scene = reader.motion, reader.robot, reader.scene
+        self.body_indexes, self.body_names = reader.body_indexes, reader.body_names
+        self.anchor_index, self.anchor_body = reader.anchor_index, reader.anchor_body
+        self._frame_indexes = frame_indexes
+        self.body_pos_relative_w, self.body_quat_relative_w = self.relative_poses()
+
+    @property
+    def frame_indexes(self) -> torch.Tensor:
+        """(N,) int64, the frames, counted over all motions."""
+        return self._frame_indexes

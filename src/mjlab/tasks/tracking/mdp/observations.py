@@ -1,0 +1,58 @@
+"""Observation terms of motion tracking. The frame of a body is seen from the robot's anchor."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from mjlab.managers.build_checks import checked_when_built
+from mjlab.tasks.tracking.mdp._shared import check_motion_term, motion_command
+from mjlab.utils.lab_api.math import matrix_from_quat, quat_apply_inverse, quat_inv, quat_mul
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+
+
+@checked_when_built(check_motion_term)
+def motion_anchor_pos_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
+    """Position of the reference's anchor in the frame of the robot's, (N, 3), in m."""
+    command = motion_command(env, command_name)
+    away = command.anchor_pos_w - command.robot_anchor_pos_w
+    return quat_apply_inverse(command.robot_anchor_quat_w, away)
+
+
+@checked_when_built(check_motion_term)
+def motion_anchor_ori_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
+    """Orientation of the reference's anchor in the frame of the robot's, (N, 6).
+
+    The first two columns of the rotation matrix, row by row.
+    """
+    command = motion_command(env, command_name)
+    relative = quat_mul(quat_inv(command.robot_anchor_quat_w), command.anchor_quat_w)
+    return _two_columns(relative)
+
+
+@checked_when_built(check_motion_term)
+def robot_body_pos_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
+    """Positions of the robot's tracked bodies in the frame of its anchor, (N, 3 K), in m."""
+    command = motion_command(env, command_name)
+    pos, anchor = command.robot_body_pos_w, command.anchor_index
+    quat = command.robot_anchor_quat_w[:, None].expand(-1, pos.shape[1], -1)
+    return quat_apply_inverse(quat, pos - pos[:, anchor : anchor + 1]).flatten(1)
+
+
+@checked_when_built(check_motion_term)
+def robot_body_ori_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
+    """Orientations of the robot's tracked bodies in the frame of its anchor, (N, 6 K).
+
+    For each body, the first two columns of the rotation matrix, row by row.
+    """
+    command = motion_command(env, command_name)
+    quat, anchor = command.robot_body_quat_w, command.anchor_index
+    relative = quat_mul(quat_inv(quat[:, anchor : anchor + 1]).expand_as(quat), quat)
+    return _two_columns(relative).flatten(1)
+
+
+def _two_columns(quat: torch.Tensor) -> torch.Tensor:
+    return matrix_from_quat(quat)[..., :2].flatten(-2)

@@ -1,0 +1,58 @@
+"""The state in which a robot starts on a frame of a motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import torch
+
+from mjlab.utils.lab_api.math import quat_from_euler_xyz, quat_mul, sample_uniform
+
+if TYPE_CHECKING:
+    from mjlab.tasks.tracking.mdp.motion_loader import MotionLibrary
+
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+"""What a range of poses or velocities may name."""
+
+
+def perturbed_start(
+    motion: MotionLibrary,
+    frames: torch.Tensor,
+    *,
+    pose_range: Mapping[str, tuple[float, float]],
+    velocity_range: Mapping[str, tuple[float, float]],
+    joint_position_range: tuple[float, float],
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return states on frames (n,), with uniform perturbations.
+
+    Positions and velocities are added to, p + (x, y, z) and v + (x, y, z), w + (roll, pitch, yaw);
+    orientations are turned in world axes, q_euler(roll, pitch, yaw) q. Numbers are drawn in the
+    order pose, velocity, joints. The root is the first of the tracked bodies.
+
+    Returns:
+        Root states (n, 13), without origins of environments, and joint positions (n, nj).
+    """
+    count, device = len(frames), str(frames.device)
+    pos, quat = motion.body_pos_w[frames, 0], motion.body_quat_w[frames, 0]
+    lin_vel, ang_vel = motion.body_lin_vel_w[frames, 0], motion.body_ang_vel_w[frames, 0]
+    joint_pos = motion.joint_pos[frames]
+    pose = _drawn(pose_range, count, device)
+    turn = quat_from_euler_xyz(*pose[:, 3:].unbind(1))
+    velocity = _drawn(velocity_range, count, device)
+    joints = sample_uniform(*joint_position_range, tuple(joint_pos.shape), device)
+    root_state = torch.cat(
+        (
+            pos + pose[:, :3],
+            quat_mul(turn, quat),
+            lin_vel + velocity[:, :3],
+            ang_vel + velocity[:, 3:],
+        ),
+        dim=1,
+    )
+    return root_state, joint_pos + joints
+
+
+def _drawn(ranges: Mapping[str, tuple[float, float]], count: int, device: str) -> torch.Tensor:
+    bounds = torch.tensor([ranges.get(axis, (0.0, 0.0)) for axis in AXES], device=device)
+    return sample_uniform(bounds[:, 0], bounds[:, 1], (count, len(AXES)), device)

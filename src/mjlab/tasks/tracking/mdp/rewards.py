@@ -1,0 +1,85 @@
+"""Reward terms of motion tracking, each exp(-E / std^2) with an error E that is 0 on the reference.
+
+Terms about bodies take the mean over all tracked bodies, or over those in `body_names`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from mjlab.managers.build_checks import checked_when_built
+from mjlab.tasks.tracking.mdp._shared import body_columns, check_motion_term, motion_command
+from mjlab.tasks.velocity.mdp.rewards import self_collision_cost as self_collision_cost
+from mjlab.utils.lab_api.math import quat_error_magnitude
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+
+BodyNames = tuple[str, ...] | None
+
+
+@checked_when_built(check_motion_term)
+def motion_global_anchor_position_error_exp(
+    env: ManagerBasedRlEnv, command_name: str, std: float
+) -> torch.Tensor:
+    """Reward the anchor's position in the world: E is its squared distance (m^2)."""
+    command = motion_command(env, command_name)
+    error = (command.anchor_pos_w - command.robot_anchor_pos_w).square().sum(dim=-1)
+    return torch.exp(error / -(std**2))
+
+
+@checked_when_built(check_motion_term)
+def motion_global_anchor_orientation_error_exp(
+    env: ManagerBasedRlEnv, command_name: str, std: float
+) -> torch.Tensor:
+    """Reward the anchor's orientation in the world: E is the squared angle (rad^2)."""
+    command = motion_command(env, command_name)
+    angle = quat_error_magnitude(command.anchor_quat_w, command.robot_anchor_quat_w)
+    return torch.exp(angle.square() / -(std**2))
+
+
+@checked_when_built(check_motion_term)
+def motion_relative_body_position_error_exp(
+    env: ManagerBasedRlEnv, command_name: str, std: float, body_names: BodyNames = None
+) -> torch.Tensor:
+    """Reward positions of bodies: E is the mean squared distance to the relative ones (m^2)."""
+    command = motion_command(env, command_name)
+    away = command.body_pos_relative_w - command.robot_body_pos_w
+    return _rewarded(away.square().sum(dim=-1), body_columns(command, body_names), std)
+
+
+@checked_when_built(check_motion_term)
+def motion_relative_body_orientation_error_exp(
+    env: ManagerBasedRlEnv, command_name: str, std: float, body_names: BodyNames = None
+) -> torch.Tensor:
+    """Reward orientations of bodies: E is the mean squared angle to the relative ones (rad^2)."""
+    command = motion_command(env, command_name)
+    angle = quat_error_magnitude(command.body_quat_relative_w, command.robot_body_quat_w)
+    return _rewarded(angle.square(), body_columns(command, body_names), std)
+
+
+@checked_when_built(check_motion_term)
+def motion_global_body_linear_velocity_error_exp(
+    env: ManagerBasedRlEnv, command_name: str, std: float, body_names: BodyNames = None
+) -> torch.Tensor:
+    """Reward velocities of bodies, in world axes: E is the mean squared error (m^2/s^2)."""
+    command = motion_command(env, command_name)
+    error = (command.body_lin_vel_w - command.robot_body_lin_vel_w).square().sum(dim=-1)
+    return _rewarded(error, body_columns(command, body_names), std)
+
+
+@checked_when_built(check_motion_term)
+def motion_global_body_angular_velocity_error_exp(
+    env: ManagerBasedRlEnv, command_name: str, std: float, body_names: BodyNames = None
+) -> torch.Tensor:
+    """Reward angular velocities of bodies, in world axes: E is the mean squared error (rad^2/s^2)."""
+    command = motion_command(env, command_name)
+    error = (command.body_ang_vel_w - command.robot_body_ang_vel_w).square().sum(dim=-1)
+    return _rewarded(error, body_columns(command, body_names), std)
+
+
+def _rewarded(errors: torch.Tensor, columns: slice | torch.Tensor, std: float) -> torch.Tensor:
+    """Return exp(-mean / std^2) of squared errors (N, K) over the chosen bodies."""
+    return torch.exp(errors[:, columns].mean(dim=-1) / -(std**2))

@@ -1,0 +1,84 @@
+"""Termination terms of motion tracking. Each returns bool (N,); limits themselves are no failure."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from mjlab.managers.build_checks import checked_when_built
+from mjlab.tasks.tracking.mdp._shared import body_columns, check_motion_term, motion_command
+from mjlab.utils.lab_api.math import quat_apply_inverse
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.managers.scene_entity_config import SceneEntityCfg
+
+BodyNames = tuple[str, ...] | None
+
+
+@checked_when_built(check_motion_term)
+def bad_anchor_pos(env: ManagerBasedRlEnv, command_name: str, threshold: float) -> torch.Tensor:
+    """The robot's anchor is further from the reference's than `threshold` (m)."""
+    command = motion_command(env, command_name)
+    away = command.anchor_pos_w - command.robot_anchor_pos_w
+    return torch.linalg.vector_norm(away, dim=1) > threshold
+
+
+@checked_when_built(check_motion_term)
+def bad_anchor_pos_z_only(
+    env: ManagerBasedRlEnv, command_name: str, threshold: float
+) -> torch.Tensor:
+    """The robot's anchor is higher or lower than the reference's by more than `threshold` (m)."""
+    command = motion_command(env, command_name)
+    return (command.anchor_pos_w[:, 2] - command.robot_anchor_pos_w[:, 2]).abs() > threshold
+
+
+@checked_when_built(check_motion_term)
+def bad_anchor_ori(
+    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg, command_name: str, threshold: float
+) -> torch.Tensor:
+    """The anchors differ in |g_z - g'_z| by more than `threshold`, whatever their headings.
+
+    g and g' are the unit vectors down in the frames of the two anchors.
+    """
+    asset: Entity = env.scene[asset_cfg.name]
+    command = motion_command(env, command_name)
+    down = asset.data.gravity_vec_w
+    reference = quat_apply_inverse(command.anchor_quat_w, down)[:, 2]
+    robot = quat_apply_inverse(command.robot_anchor_quat_w, down)[:, 2]
+    return (reference - robot).abs() > threshold
+
+
+@checked_when_built(check_motion_term)
+def bad_motion_body_pos(
+    env: ManagerBasedRlEnv, command_name: str, threshold: float, body_names: BodyNames = None
+) -> torch.Tensor:
+    """Any body (of `body_names`, or tracked) is further from its relative place than `threshold`."""
+    command = motion_command(env, command_name)
+    columns = body_columns(command, body_names)
+    away = command.body_pos_relative_w[:, columns] - command.robot_body_pos_w[:, columns]
+    return (torch.linalg.vector_norm(away, dim=-1) > threshold).any(dim=1)
+
+
+@checked_when_built(check_motion_term)
+def bad_motion_body_pos_z_only(
+    env: ManagerBasedRlEnv, command_name: str, threshold: float, body_names: BodyNames = None
+) -> torch.Tensor:
+    """Any body (of `body_names`, or tracked) is above or below its place by more than `threshold`."""
+    command = motion_command(env, command_name)
+    columns = body_columns(command, body_names)
+    away = command.body_pos_relative_w[:, columns, 2] - command.robot_body_pos_w[:, columns, 2]
+    return (away.abs() > threshold).any(dim=1)
+
+
+@checked_when_built(check_motion_term)
+def motion_ended(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
+    """The motion has no further frame. A time-out: nothing the robot did ended it.
+
+    Without such a term the command puts the robot onto another frame in the middle of the episode,
+    as mjlab 1.6 does, and the values that are learned span the jump.
+    """
+    command = motion_command(env, command_name)
+    return command.time_steps >= command.motion.lengths[command.motion_ids] - 1

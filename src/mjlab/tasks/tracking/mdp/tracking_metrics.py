@@ -1,0 +1,43 @@
+"""What the motion command logs of every episode: how far robot and reference are apart."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from mjlab.utils.lab_api.math import quat_error_magnitude
+
+if TYPE_CHECKING:
+    from mjlab.tasks.tracking.mdp.motion_reader import MotionReader
+
+
+def tracking_metrics(motion: MotionReader) -> dict[str, torch.Tensor]:
+    """Return errors by name, (N,) each.
+
+    Those of positions and velocities are Euclidean norms (m, m/s, rad/s), those of orientations
+    angles (rad), those of bodies means over the tracked bodies, and those of joints the norm over
+    all joints (rad, rad/s). Poses of bodies are compared with the relative ones; velocities are in
+    world axes.
+    """
+    anchor = motion.anchor_index
+    pos, quat = motion.robot_body_pos_w, motion.robot_body_quat_w
+    lin_error = _norm(motion.body_lin_vel_w - motion.robot_body_lin_vel_w)
+    ang_error = _norm(motion.body_ang_vel_w - motion.robot_body_ang_vel_w)
+    body_rot = quat_error_magnitude(motion.body_quat_relative_w, quat)
+    return {
+        "error_anchor_pos": _norm(motion.anchor_pos_w - pos[:, anchor]),
+        "error_anchor_rot": quat_error_magnitude(motion.anchor_quat_w, quat[:, anchor]),
+        "error_anchor_lin_vel": lin_error[:, anchor],
+        "error_anchor_ang_vel": ang_error[:, anchor],
+        "error_body_pos": _norm(motion.body_pos_relative_w - pos).mean(dim=1),
+        "error_body_rot": body_rot.mean(dim=1),
+        "error_body_lin_vel": lin_error.mean(dim=1),
+        "error_body_ang_vel": ang_error.mean(dim=1),
+        "error_joint_pos": _norm(motion.joint_pos - motion.robot_joint_pos),
+        "error_joint_vel": _norm(motion.joint_vel - motion.robot_joint_vel),
+    }
+
+
+def _norm(difference: torch.Tensor) -> torch.Tensor:
+    return torch.linalg.vector_norm(difference, dim=-1)

@@ -1,0 +1,5 @@
+"""Training of motion tracking."""
+
+from mjlab.tasks.tracking.rl.runner import (
+    MotionTrackingOnPolicyRunner as MotionTrackingOnPolicyRunner,
+)

@@ -1,0 +1,152 @@
+"""The runner of motion tracking."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from pathlib import Path
+from typing import Any
+
+from mjlab.rl.onnx_export import export_to_onnx
+from mjlab.rl.rsl import VecEnv
+from mjlab.rl.runner import MjlabOnPolicyRunner
+from mjlab.tasks.tracking.mdp.motion_command import MotionCommand
+from mjlab.tasks.tracking.motion_record import record_motions
+from mjlab.tasks.tracking.rl.onnx_model import PolicyWithReference
+from mjlab.tasks.tracking.wandb_motions import full_artifact_name
+
+logger = logging.getLogger(__name__)
+
+_FAILURES = "motion_failures"
+
+
+class MotionTrackingOnPolicyRunner(MjlabOnPolicyRunner):
+    """Trains as `MjlabOnPolicyRunner` does, exports the policy with the reference whenever it saves,
+    and keeps the motions in the run's folder.
+
+    Checkpoints hold the statistics of failures, so that a run that resumes, with however many
+    environments, still knows where the robot fails.
+    """
+
+    exports_on_save = True
+
+    def __init__(
+        self,
+        env: VecEnv,
+        train_cfg: dict,
+        log_dir: str | None = None,
+        device: str = "cpu",
+        registry_name: str | None = None,
+    ) -> None:
+        """Build networks and algorithm.
+
+        Args:
+            env: The environments.
+            train_cfg: A `RslRlOnPolicyRunnerCfg` as a dict; it is edited here and by rsl_rl.
+            log_dir: Folder of the run. None: nothing is written.
+            device: Device of the networks.
+            registry_name: Weights & Biases artifact that the motion comes from; a run that logs
+                there is marked as using it.
+
+        Raises:
+            ValueError: the environments have no motion command.
+        """
+        super().__init__(env, train_cfg, log_dir, device)
+        self.motion_command: MotionCommand = _motion_command(self.env.unwrapped)
+        self._registry_name = registry_name
+        self._is_marked = False
+
+    def save(self, path: str, infos=None) -> None:
+        """Write a checkpoint, and the policy as `<folder>/<folder's name>.onnx` beside it.
+
+        At the first time the motions are copied into the folder. What fails after the checkpoint is
+        logged, and training goes on.
+
+        Args:
+            path: Where to write the checkpoint.
+            infos: Further plain data, which `load` returns.
+
+        Raises:
+            CheckpointError: the checkpoint could not be written.
+        """
+        sampler = self.motion_command.sampler
+        if sampler is not None:
+            infos = {**(infos or {}), _FAILURES: sampler.failed.cpu().clone()}
+        super().save(path, infos)
+        if not self._writes:
+            return
+        folder = Path(path).resolve().parent
+        try:
+            self._keep_motions(folder)
+        except Exception as error:
+            logger.warning("The motions were not recorded in %s: %s", folder, error)
+        self.export_policy(str(folder / f"{folder.name}.onnx"))
+
+    def load(
+        self,
+        path: str,
+        load_cfg: dict | None = None,
+        strict: bool = True,
+        map_location: str | None = None,
+    ) -> dict:
+        """Load a checkpoint, and with all of it the statistics of failures, if they fit.
+
+        Arguments, result and errors are those of `MjlabOnPolicyRunner.load`.
+        """
+        infos = super().load(path, load_cfg, strict, map_location)
+        sampler, failed = self.motion_command.sampler, infos.get(_FAILURES)
+        if load_cfg is None and sampler is not None and failed is not None:
+            if failed.shape == sampler.failed.shape:
+                sampler.failed.copy_(failed)
+            else:
+                logger.warning(
+                    "The statistics of failures start anew: they are of %d segments, and the "
+                    "motions have %d.", len(failed), sampler.num_bins,
+                )  # fmt: skip
+        return infos
+
+    def export_policy_to_onnx(
+        self, path: str, filename: str = "policy.onnx", verbose: bool = False
+    ) -> None:
+        """Write the policy and the reference to `path`/`filename`: see `PolicyWithReference`."""
+        policy = self.alg.get_policy().as_onnx(verbose=verbose)
+        model = PolicyWithReference(policy, self.motion_command.motion)
+        export_to_onnx(model, Path(path) / filename, verbose)
+
+    def onnx_metadata(self) -> dict[str, Any]:
+        """Return the metadata of the base with what the reference is of."""
+        command = self.motion_command
+        metadata = super().onnx_metadata()
+        metadata |= {
+            "anchor_body_name": command.cfg.anchor_body_name,
+            "body_names": list(command.body_names),
+            "motion_names": list(command.motion.names),
+            "motion_starts": command.motion.starts.tolist(),
+            "motion_lengths": command.motion.lengths.tolist(),
+        }
+        return metadata
+
+    def _keep_motions(self, folder: Path) -> None:
+        new = record_motions(self.motion_command.motion_files, folder, self._registry_name)
+        # Whoever has a live run at Weights & Biases has imported wandb.
+        wandb: Any = sys.modules.get("wandb")
+        if self.cfg.get("logger") != "wandb" or getattr(wandb, "run", None) is None:
+            return
+        if self.cfg.get("upload_model", True):
+            for path in new:
+                wandb.save(str(path), base_path=str(folder))
+        if self._registry_name is not None and not self._is_marked:
+            self._is_marked = True
+            wandb.run.use_artifact(full_artifact_name(self._registry_name))
+
+
+def _motion_command(env: Any) -> MotionCommand:
+    manager = env.command_manager
+    terms = [manager.get_term(name) for name in manager.active_terms]
+    found = [term for term in terms if isinstance(term, MotionCommand)]
+    if not found:
+        raise ValueError(
+            f"MotionTrackingOnPolicyRunner needs a MotionCommand; the commands are "
+            f"{list(manager.active_terms)}."
+        )
+    return found[0]

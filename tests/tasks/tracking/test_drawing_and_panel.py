@@ -1,0 +1,251 @@
+"""The reference in viewers: the ghost, the slider, the button, and the errors of the bodies."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from tracking_tasks import task_cfg, unperturbed
+
+from mjlab.asset_zoo.robots import get_go1_robot_cfg
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.tasks.tracking.mdp.motion_drawing import ghost_model
+
+
+class Board:
+    """A drawing board that writes down what is drawn."""
+
+    def __init__(self, *indices: int):
+        self.ghosts, self.frames, self._indices = [], [], indices
+
+    def get_env_indices(self, num_envs):
+        return [i for i in self._indices if i < num_envs]
+
+    def add_ghost_mesh(self, qpos, model, alpha):
+        self.ghosts.append((qpos.copy(), model, alpha))
+
+    def add_frame(self, position, rotation, scale, axis_radius, axis_colors):
+        self.frames.append((np.asarray(position), scale, axis_colors))
+
+
+class Widget:
+    """A control of a page."""
+
+    def __init__(self, value=None, **options):
+        self.value, self.options, self.callbacks = value, options, []
+        self.disabled, self.max = options.get("disabled", False), options.get("max")
+        self.content = ""
+
+    def on_update(self, callback):
+        self.callbacks.append(callback)
+        return callback
+
+    on_click = on_update
+
+    def set_by_person(self, value=None) -> None:
+        self.value = value
+        for callback in self.callbacks:
+            callback(SimpleNamespace(client=object()))
+
+
+class Page:
+    """A page that keeps its controls by label."""
+
+    def __init__(self):
+        self.gui, self.widgets = self, {}
+
+    def add_folder(self, name, **_):
+        return self
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def _add(self, label, *args, **kwargs):
+        self.widgets[label] = Widget(*args, **kwargs)
+        return self.widgets[label]
+
+    def add_slider(self, label, low, high, step, value, **kwargs):
+        return self._add(label, value, max=high, **kwargs)
+
+    def add_dropdown(self, label, options, *, initial_value, **kwargs):
+        return self._add(label, initial_value, **kwargs)
+
+    def add_checkbox(self, label, value, **kwargs):
+        return self._add(label, value, **kwargs)
+
+    def add_button(self, label, **kwargs):
+        return self._add(label, **kwargs)
+
+    def add_markdown(self, content):
+        return self._add("table")
+
+
+@pytest.fixture
+def env():
+    cfg = task_cfg("squat,wave", num_envs=3, edit=unperturbed, sampling_mode="start")
+    # Something else in the scene that moves.
+    cfg.scene.entities = {**cfg.scene.entities, "dog": get_go1_robot_cfg()}
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    env.reset()
+    yield env
+    env.close()
+
+
+def command_of(env):
+    return env.command_manager.get_term("motion")
+
+
+def test_the_ghost_is_the_robot_alone_in_one_colour(env):
+    command, board = command_of(env), Board(1)
+    command.drawing.draw(board)
+    ((qpos, model, alpha),) = board.ghosts
+    assert model.nq == len(qpos) == 36
+    assert alpha == 0.5
+    root = command.motion.body_pos_w[command.frame_indexes[1], 0] + env.scene.env_origins[1]
+    np.testing.assert_allclose(qpos[:3], root.numpy(), atol=1e-6)
+    np.testing.assert_allclose(qpos[7:], command.joint_pos[1].numpy(), atol=1e-6)
+    is_shown = model.geom_group <= 2
+    assert is_shown.any()
+    assert (model.geom_contype[is_shown] == 0).all()
+    np.testing.assert_allclose(model.geom_rgba[is_shown], [[0.5, 0.7, 0.5, 0.5]] * is_shown.sum())
+    assert (model.geom_matid == -1).all()
+    # The model of the robot in the scene keeps its looks.
+    assert not (env.sim.mj_model.geom_rgba[:, 3] == 0.5).any()
+
+
+def test_ghosts_are_drawn_for_the_environments_in_view_and_may_stand_beside(env):
+    command, board = command_of(env), Board(0, 2)
+    command.drawing.draw(board)
+    at_reference = [qpos for qpos, *_ in board.ghosts]
+    command.drawing.offset[1] = 1.0
+    board = Board(0, 2)
+    command.drawing.draw(board)
+    for (qpos, *_), before in zip(board.ghosts, at_reference, strict=True):
+        np.testing.assert_allclose(qpos[:3] - before[:3], [0.0, 1.0, 0.0], atol=1e-6)
+    nothing = Board()
+    command.drawing.draw(nothing)
+    assert not nothing.ghosts
+    # The config is no place for what is changed meanwhile.
+    assert command.cfg.viz.ghost_offset == (0.0, 0.0, 0.0)
+
+
+def test_a_robot_that_is_only_shapes_that_collide_has_a_ghost_too(env):
+    class AllCollide:
+        cfg = SimpleNamespace(
+            build=lambda: SimpleNamespace(
+                compile=lambda: __import__("mujoco").MjModel.from_xml_string(
+                    "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+                )
+            )
+        )
+
+    model = ghost_model(AllCollide(), (1.0, 0.0, 0.0, 0.3))
+    assert model.geom_group.tolist() == [0]
+    np.testing.assert_allclose(model.geom_rgba[0], [1.0, 0.0, 0.0, 0.3])
+
+
+def test_frames_of_reference_and_robot_can_be_drawn_instead(env):
+    command, board = command_of(env), Board(0)
+    command.cfg.viz.mode = "frames"
+    command.drawing.draw(board)
+    assert len(board.frames) == 28
+    assert sorted({scale for _, scale, _ in board.frames}) == [0.08, 0.1, 0.12, 0.15]
+    np.testing.assert_allclose(board.frames[0][0], command.body_pos_w[0, 0].numpy(), atol=1e-6)
+    np.testing.assert_allclose(
+        board.frames[14][0], command.robot_body_pos_w[0, 0].numpy(), atol=1e-6
+    )
+
+
+@pytest.fixture
+def panel(env):
+    """A page with the panel, the environment in view, and what was asked of the viewer."""
+    page, asked, view = Page(), [], [0]
+    command_of(env).create_gui(
+        "motion", page, lambda: view[0], lambda: asked.append("redraw"),
+        lambda name, payload: asked.append((name, payload)),
+    )  # fmt: skip
+    return SimpleNamespace(page=page.widgets, asked=asked, view=view)
+
+
+def drawn(env):
+    command_of(env)._debug_vis_impl(Board(0))
+
+
+def test_the_slider_follows_the_reference_while_playing(env, panel):
+    for _ in range(3):
+        env.step(torch.zeros(3, 29))
+    drawn(env)
+    assert panel.page["Frame"].value == 4
+    assert panel.page["Frame"].disabled
+    assert panel.page["Frame"].max == 220
+    panel.view[0] = 1
+    drawn(env)
+    assert panel.page["Motion"].value == "wave"
+    assert panel.page["Frame"].max == 260
+    # Nobody moves the reference while it plays.
+    panel.page["Frame"].set_by_person(77)
+    drawn(env)
+    assert command_of(env).time_steps.tolist() == [4, 4, 4]
+
+
+def test_the_slider_moves_the_reference_of_the_environment_in_view_while_paused(env, panel):
+    command = command_of(env)
+    env.command_manager.on_viewer_pause(True)
+    assert not panel.page["Frame"].disabled
+    panel.page["Frame"].set_by_person(100)
+    assert panel.asked == ["redraw"]
+    # Only when the viewer draws, which is not while a step is computed.
+    assert command.time_steps.tolist() == [1, 1, 1]
+    drawn(env)
+    assert command.time_steps.tolist() == [100, 1, 1]
+    panel.page["Motion"].set_by_person("wave")
+    panel.page["Frame"].set_by_person(250)
+    drawn(env)
+    assert (command.motion_ids[0], command.time_steps[0]) == (1, 250)
+    env.command_manager.on_viewer_pause(False)
+    assert panel.page["Frame"].disabled
+
+
+def test_start_here_puts_robots_exactly_there(env, panel):
+    command = command_of(env)
+    env.command_manager.on_viewer_pause(True)
+    panel.page["Frame"].set_by_person(110)
+    drawn(env)
+    panel.page["All envs"].value = False
+    panel.page["Start Here"].set_by_person()
+    assert panel.asked[-1] == ("start_here", {"type": "gui_reset", "all_envs": False})
+    ids = torch.tensor([0])
+    env.reset(env_ids=ids)
+    assert env.command_manager.apply_gui_reset(ids)
+    assert (command.time_steps[0], command.motion_ids[0]) == (110, 0)
+    away = (command.robot_body_pos_w - command.body_pos_w)[0].abs().max()
+    assert away < 1e-4
+    torch.testing.assert_close(command.body_pos_relative_w, command.relative_poses()[0])
+    # It was asked for once.
+    assert not env.command_manager.apply_gui_reset(ids)
+
+
+def test_the_errors_of_the_bodies_are_listed(env, panel):
+    drawn(env)
+    lines = panel.page["table"].content.splitlines()
+    assert len(lines) == 2 + 14
+    assert lines[2].split("|")[1].strip() == "pelvis"
+    # Of matching times: the robot stands exactly on its frame.
+    assert {line.split("|")[2].strip() for line in lines[2:]} == {"0.0"}
+    env.command_manager.on_viewer_pause(True)
+    panel.page["Frame"].set_by_person(110)
+    drawn(env)
+    lines = panel.page["table"].content.splitlines()
+    # Half way down, the pelvis of the reference is far below.
+    assert float(lines[2].split("|")[2]) > 15.0
+
+
+def test_without_a_page_nothing_is_asked_for(env):
+    command = command_of(env)
+    command.on_viewer_pause(True)
+    assert not command.apply_gui_reset(torch.arange(3))

@@ -1,0 +1,142 @@
+"""Evaluations: every environment plays a motion once, and errors are of matching times."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+
+import pytest
+import torch
+from tracking_tasks import G1, part_of, task_cfg, unperturbed
+
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.rl import RslRlVecEnvWrapper
+from mjlab.rl.evaluate import evaluate_policy
+from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
+from mjlab.tasks.registry import load_rl_cfg
+from mjlab.tasks.tracking.evaluation import TRACKING_ERRORS, play_motions_once
+from mjlab.tasks.tracking.motion_file import read_motion
+from mjlab.tasks.tracking.motion_sources import shipped_motions
+from mjlab.tasks.tracking.options import MotionOptions
+
+
+@pytest.fixture
+def short(tmp_path):
+    """A motion of half a second, in which nobody can fall."""
+    return part_of("wave", slice(0, 25), tmp_path / "short.npz")
+
+
+def evaluated(motion, policy=None, num_envs=4, edit=None, **kwargs):
+    cfg = task_cfg(motion, num_envs=num_envs)
+    play_motions_once(cfg)
+    if edit is not None:
+        edit(cfg)
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    zero = torch.zeros(num_envs, 29)
+    try:
+        return evaluate_policy(
+            RslRlVecEnvWrapper(env),
+            policy or (lambda observations: zero),
+            metrics=TRACKING_ERRORS,
+            success_is_survival=True,
+            seed=3,
+            **kwargs,
+        )
+    finally:
+        env.close()
+
+
+def test_the_task_measures_these_and_calls_survival_success():
+    evaluation = load_rl_cfg(G1).evaluation
+    assert list(evaluation.metrics) == [
+        "mpkpe", "r_mpkpe", "joint_vel_error", "ee_pos_error", "ee_ori_error",
+    ]  # fmt: skip
+    assert evaluation.success_is_survival
+    assert evaluation.prepare_env is play_motions_once
+    # What a training run hands on.
+    assert asdict(evaluation)["metrics"] == TRACKING_ERRORS
+
+
+def test_each_episode_is_the_motion_from_its_start_to_its_end(short):
+    result = evaluated(short)
+    # Frames 1 to 24 are to be reached.
+    assert result.mean_length == 24
+    assert result.success_rate == 1.0
+    assert result.terminations["motion_ended"] == 1.0
+    assert result.num_unfinished == 0
+
+
+def test_a_motion_longer_than_an_episode_is_played_to_its_end(tmp_path, short):
+    cfg = task_cfg("squat")
+    cfg.episode_length_s = 2.0
+    play_motions_once(cfg)
+    assert cfg.episode_length_s == pytest.approx(221 * 0.02)
+    assert "push_robot" not in cfg.events
+    assert cfg.commands["motion"].sampling_mode == "start"
+    # Noise, randomization and perturbed starts stay.
+    assert cfg.observations["actor"].enable_corruption
+    assert cfg.commands["motion"].pose_range
+    assert "foot_friction" in cfg.events
+
+
+def test_several_motions_are_played_by_as_many_environments_each(short, tmp_path):
+    other = part_of("wave", slice(0, 15), tmp_path / "other.npz")
+    result = evaluated(f"{short},{other}")
+    assert result.mean_length == (24 + 14) / 2
+
+
+def test_one_seed_gives_the_same_figures_and_another_one_others(short):
+    one, other = (evaluated(short) for _ in range(2))
+    assert one.returns == other.returns
+    assert one.metrics == other.metrics
+
+
+def test_errors_are_of_matching_times_and_of_no_state_after_a_reset(tmp_path):
+    """The reference stands still for nine frames and is three metres away in the last one."""
+    places = read_motion(shipped_motions()["wave"]).body_pos_w[:10].copy()
+    places[9, :, 0] += 3.0
+    path = part_of("wave", slice(0, 10), tmp_path / "jump.npz", body_pos_w=places)
+    result = evaluated(path, edit=unperturbed)
+    assert result.mean_length == 9
+    # The policy acts at frames 0 to 8. Any pair of a state with a frame of another time, or with
+    # one before a reset, has an error of three metres.
+    assert result.metrics["mpkpe"].mean < 0.05
+    assert evaluated(path, edit=unperturbed, max_steps=1).metrics["mpkpe"].mean < 1e-4
+
+
+def test_the_command_reports_intervals_as_a_table_and_as_json(short, capsys):
+    cfg = EvaluateConfig(agent="zero", num_episodes=5, device="cpu", json=True)
+    cfg.options = MotionOptions(motion_file=str(short))
+    figures = run_evaluate(G1, cfg)
+    printed = json.loads(capsys.readouterr().out)
+    for name in TRACKING_ERRORS:
+        low, high = printed["metrics"][name]["interval"]
+        assert low <= printed["metrics"][name]["mean"] <= high
+    assert printed["success_rate"] == figures["success_rate"] == 1.0
+    assert printed["success_interval"][0] > 0.5
+    assert figures["mean_length"] == 24
+    cfg.json = False
+    run_evaluate(G1, cfg)
+    table = capsys.readouterr().out
+    for word in ("Success", "95 % interval", *TRACKING_ERRORS):
+        assert word in table
+
+
+def test_the_script_of_the_interface_writes_its_figures(short, tmp_path, capsys):
+    from mjlab.tasks.tracking.scripts.evaluate import (
+        EvaluateTrackingConfig,
+        run_evaluate_tracking,
+    )
+
+    path = tmp_path / "out" / "figures.json"
+    cfg = EvaluateTrackingConfig(agent="zero", num_envs=3, device="cpu", output_file=str(path))
+    cfg.options = MotionOptions(motion_file=str(short))
+    means = run_evaluate_tracking(G1, cfg)
+    keys = ["success_rate", *TRACKING_ERRORS]
+    assert list(means) == keys
+    written = json.loads(path.read_text())
+    assert list(written)[:6] == keys
+    assert len(written["mpkpe_interval"]) == 2
+    assert f"mpkpe            {means['mpkpe']:.4f}" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="does not track motions"):
+        run_evaluate_tracking("Mjlab-Cartpole-Balance", cfg)

@@ -1,0 +1,179 @@
+"""Motion files: what is written is read, and what is no motion of the robot is refused in one message."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tracking_tasks import part_of
+
+from mjlab.tasks.tracking.motion_file import (
+    MotionFileError,
+    check_motion_fits,
+    read_motion,
+    write_motion,
+)
+from mjlab.tasks.tracking.motion_sources import find_motions, shipped_motions
+
+ARRAYS = ("joint_pos", "joint_vel", "body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w")
+SQUAT = read_motion(shipped_motions()["squat"])
+
+
+def arrays(**changes) -> dict:
+    """Return the content of a good file of ten frames, as other tools write it, with changes."""
+    content = {"fps": np.array([50])} | {key: getattr(SQUAT, key)[:10].copy() for key in ARRAYS}
+    content.update(changes)
+    return {key: value for key, value in content.items() if value is not None}
+
+
+def saved(tmp_path, **changes):
+    path = tmp_path / "motion.npz"
+    np.savez(path, **arrays(**changes))
+    return path
+
+
+def test_what_is_written_is_read(tmp_path):
+    path = write_motion(tmp_path / "folder" / "again", SQUAT)
+    again = read_motion(path)
+    assert path.name == "again.npz"
+    assert (again.fps, again.joint_names, again.body_names) == (
+        50.0,
+        SQUAT.joint_names,
+        SQUAT.body_names,
+    )
+    for key in ARRAYS:
+        np.testing.assert_allclose(getattr(again, key), getattr(SQUAT, key), atol=1e-6)
+        assert getattr(again, key).dtype == np.float32
+
+
+def test_the_same_motion_gives_the_same_bytes(tmp_path):
+    one, other = (write_motion(tmp_path / name, SQUAT) for name in ("one", "other"))
+    assert one.read_bytes() == other.read_bytes()
+    assert [p.name for p in sorted(tmp_path.iterdir())] == ["one.npz", "other.npz"]
+
+
+def test_a_file_of_another_tool_loads_as_it_is(tmp_path):
+    path = saved(tmp_path, joint_pos=SQUAT.joint_pos[:10].astype(np.float64))
+    motion = read_motion(path)
+    assert (motion.fps, motion.num_frames, motion.joint_names) == (50.0, 10, ())
+    check_motion_fits(path, motion, SQUAT.joint_names, SQUAT.body_names, 0.02)
+
+
+def test_a_file_without_a_rate_is_taken_at_that_of_the_task(tmp_path):
+    path = saved(tmp_path, fps=None)
+    motion = read_motion(path)
+    assert motion.fps is None
+    check_motion_fits(path, motion, SQUAT.joint_names, SQUAT.body_names, 0.01)
+
+
+def with_nan() -> np.ndarray:
+    values = SQUAT.body_lin_vel_w[:10].copy()
+    values[7, 3, 1] = np.nan
+    return values
+
+
+def with_long_quaternion() -> np.ndarray:
+    values = SQUAT.body_quat_w[:10].copy()
+    values[4, 2] *= 1.1
+    return values
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"joint_vel": None}, r"lacks \['joint_vel'\]; it has .*csv_to_npz"),
+        (
+            {"body_lin_vel_w": with_nan()},
+            "1 numbers that are NaN or infinite, the first in frame 7",
+        ),
+        ({"body_quat_w": with_long_quaternion()}, "frame 4, body 2 its norm is 1.1"),
+        ({"joint_pos": SQUAT.joint_pos[:9]}, "differ in frames: .*'joint_pos': 9, 'joint_vel': 10"),
+        ({"body_pos_w": SQUAT.body_pos_w[:10, :5]}, "differ in columns: .*'body_pos_w': 5"),
+        ({"joint_pos": SQUAT.joint_pos[0]}, r"shape \(29,\); it has to be \(frames, joints\)"),
+        ({"body_quat_w": SQUAT.body_pos_w[:10]}, r"has to be \(frames, bodies, 4\)"),
+        ({key: getattr(SQUAT, key)[:0] for key in ARRAYS}, "0 frames; it needs at least 2"),
+        ({key: getattr(SQUAT, key)[:1] for key in ARRAYS}, "1 frames; it needs at least 2"),
+        ({"fps": np.array([0.0])}, "fps of the motion .* has to be one rate above 0"),
+        ({"fps": np.array([50, 60])}, "fps of the motion .* has to be one rate above 0"),
+        ({"joint_pos": np.full((10, 29), "a")}, "holds <U1, and no numbers"),
+        ({"joint_names": np.array(["a", "b"])}, "2 joint_names, and 29 columns in joint_pos"),
+        ({"body_names": np.arange(30)}, "body_names .* has to be a list of texts"),
+    ],
+)
+def test_what_is_no_motion_is_refused(tmp_path, changes, message):
+    with pytest.raises(MotionFileError, match=message):
+        read_motion(saved(tmp_path, **changes))
+
+
+def test_a_pickle_is_not_executed(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (pytest.fail, ("the file was executed",))
+
+    path = saved(tmp_path, joint_pos=np.array([Trap()], dtype=object))
+    with pytest.raises(MotionFileError, match="cannot be read as a motion"):
+        read_motion(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 cut short"])
+def test_a_damaged_file_is_refused(tmp_path, content):
+    path = tmp_path / "motion.npz"
+    path.write_bytes(content)
+    with pytest.raises(MotionFileError, match="cannot be read as a motion"):
+        read_motion(path)
+    with pytest.raises(MotionFileError, match="There is no motion file"):
+        read_motion(tmp_path / "other.npz")
+
+
+@pytest.mark.parametrize(
+    ("joints", "bodies", "dt", "message"),
+    [
+        (SQUAT.joint_names[:23], SQUAT.body_names, 0.02, "has 29 joints, and the robot 23"),
+        (SQUAT.joint_names, SQUAT.body_names[1:], 0.02, "has 30 bodies, and the robot 29"),
+        (
+            SQUAT.joint_names[1:] + SQUAT.joint_names[:1], SQUAT.body_names, 0.02,
+            "number 0 is 'left_hip_pitch_joint' in the motion and 'left_hip_roll_joint' in the robot",
+        ),
+        (
+            SQUAT.joint_names, (*SQUAT.body_names[:-1], "hand"), 0.02,
+            "number 29 is 'right_wrist_yaw_link' in the motion and 'hand' in the robot",
+        ),
+        (
+            SQUAT.joint_names, SQUAT.body_names, 1 / 30,
+            r"has 50 frames per second, and the task is controlled 30 times .*--output-fps 30",
+        ),
+    ],
+)  # fmt: skip
+def test_a_motion_of_another_robot_or_rate_is_refused(joints, bodies, dt, message):
+    with pytest.raises(MotionFileError, match=message):
+        check_motion_fits("squat.npz", SQUAT, joints, bodies, dt)
+
+
+def test_motions_are_found_by_name_by_file_and_by_folder(tmp_path):
+    one = part_of("wave", slice(0, 5), tmp_path / "b.npz")
+    other = part_of("wave", slice(0, 5), tmp_path / "a.npz")
+    assert find_motions("squat") == [shipped_motions()["squat"]]
+    assert find_motions(f"wave, {one}") == [shipped_motions()["wave"], one]
+    assert find_motions(str(tmp_path)) == [other, one]
+
+
+def test_a_path_with_a_comma_is_one_path(tmp_path):
+    path = part_of("wave", slice(0, 5), tmp_path / "a, b.npz")
+    assert find_motions(str(path)) == [path]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "No motion is named.*side_step, slow_walk, squat"),
+        ("sqat", "Did you mean 'squat'"),
+        ("squat,dance.npz", "There is no motion file 'dance.npz'"),
+    ],
+)
+def test_motions_that_are_not_there_are_told(text, message):
+    with pytest.raises(MotionFileError, match=message):
+        find_motions(text)
+
+
+def test_a_folder_without_motions_is_told(tmp_path):
+    with pytest.raises(MotionFileError, match="has no motion"):
+        find_motions(str(tmp_path))

@@ -1,0 +1,203 @@
+"""Training: policies with their reference, motions kept with the run, failures not forgotten."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from tracking_tasks import G1, G1_BLIND, task_cfg
+
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.rl import RslRlVecEnvWrapper
+from mjlab.tasks.registry import load_rl_cfg, load_runner_cls
+from mjlab.tasks.tracking.motion_file import MotionFileError
+from mjlab.tasks.tracking.motion_record import record_motions, recorded_motions
+from mjlab.tasks.tracking.motion_sources import shipped_motions
+from mjlab.tasks.tracking.rl import MotionTrackingOnPolicyRunner
+from mjlab.utils.random import seed_rng
+
+
+@pytest.fixture
+def make_runner():
+    """Build runners of a small policy in small environments, writing to a folder."""
+    built = []
+
+    def make(
+        log_dir: Path | None = None, num_envs=6, task=G1, motion="squat,wave", **kwargs
+    ) -> MotionTrackingOnPolicyRunner:
+        seed_rng(1)
+        env = ManagerBasedRlEnv(task_cfg(motion, num_envs=num_envs, task=task), device="cpu")
+        built.append(env)
+        cfg = asdict(load_rl_cfg(task))
+        cfg["num_steps_per_env"], cfg["save_interval"] = 4, 100
+        for model in ("actor", "critic"):
+            cfg[model]["hidden_dims"] = (16,)
+        cfg["logger"] = kwargs.pop("logger", "tensorboard")
+        folder = None if log_dir is None else str(log_dir)
+        return MotionTrackingOnPolicyRunner(RslRlVecEnvWrapper(env), cfg, folder, "cpu", **kwargs)
+
+    yield make
+    for env in built:
+        env.close()
+
+
+def weights(runner) -> torch.Tensor:
+    return torch.cat([p.detach().flatten() for p in runner.alg.get_policy().parameters()])
+
+
+def test_the_tasks_are_trained_by_this_runner():
+    for task in (G1, G1_BLIND):
+        assert load_runner_cls(task) is MotionTrackingOnPolicyRunner
+
+
+@pytest.mark.parametrize(("task", "size"), [(G1, 160), (G1_BLIND, 154)])
+def test_the_exported_policy_carries_the_reference(make_runner, tmp_path, task, size):
+    runner = make_runner(task=task)
+    folder = tmp_path / "2026-01-02_dance"
+    runner.save(str(folder / "model_7.pt"))
+    session = onnxruntime.InferenceSession(folder / "2026-01-02_dance.onnx")
+    assert [(i.name, i.shape) for i in session.get_inputs()] == [
+        ("obs", [1, size]), ("time_step", [1, 1]),
+    ]  # fmt: skip
+    assert [(o.name, o.shape) for o in session.get_outputs()] == [
+        ("actions", [1, 29]), ("joint_pos", [1, 29]), ("joint_vel", [1, 29]),
+        ("body_pos_w", [1, 14, 3]), ("body_quat_w", [1, 14, 4]),
+        ("body_lin_vel_w", [1, 14, 3]), ("body_ang_vel_w", [1, 14, 3]),
+    ]  # fmt: skip
+    motion = runner.motion_command.motion
+    obs = torch.randn(1, size)
+    policy = runner.alg.get_policy()
+    policy.eval()
+    with torch.inference_mode():
+        expected = policy({"actor": obs}).numpy()
+    last = motion.time_step_total - 1
+    for step, frame in ((0.0, 0), (17.9, 17), (300.0, 300), (1e6, last), (-3.0, 0)):
+        found = session.run(None, {"obs": obs.numpy(), "time_step": np.array([[step]], np.float32)})
+        np.testing.assert_allclose(found[0], expected, atol=1e-5)
+        for output, values in zip(session.get_outputs()[1:], found[1:], strict=True):
+            np.testing.assert_array_equal(values[0], getattr(motion, output.name)[frame].numpy())
+
+
+def test_the_exported_policy_says_what_its_reference_is_of(make_runner, tmp_path):
+    runner = make_runner()
+    runner.save(str(tmp_path / "run" / "model_0.pt"))
+    model = onnx.load(tmp_path / "run" / "run.onnx")
+    assert model.opset_import[0].version == 18
+    metadata = {entry.key: entry.value for entry in model.metadata_props}
+    assert metadata["anchor_body_name"] == "torso_link"
+    assert metadata["body_names"].split(",") == list(runner.motion_command.body_names)
+    assert metadata["motion_names"] == "squat,wave"
+    assert (metadata["motion_starts"], metadata["motion_lengths"]) == ("0,221", "221,261")
+    assert metadata["command_names"] == "motion"
+    assert metadata["observation_names"].startswith("command,motion_anchor_pos_b")
+    assert len(metadata["joint_names"].split(",")) == 29
+
+
+def test_the_motions_are_kept_in_the_folder_of_the_run(make_runner, tmp_path):
+    runner = make_runner(tmp_path / "run")
+    runner.learn(1)
+    files = recorded_motions(tmp_path / "run")
+    assert [path.name for path in files] == ["squat.npz", "wave.npz"]
+    for path in files:
+        assert path.read_bytes() == shipped_motions()[path.stem].read_bytes()
+    entries = json.loads((tmp_path / "run" / "motion" / "motions.json").read_text())
+    assert entries[0]["source"] == str(shipped_motions()["squat"].resolve())
+    assert len(entries[0]["sha256"]) == 64
+
+
+def test_a_record_is_made_once_and_checked(tmp_path):
+    squat, wave = (shipped_motions()[name] for name in ("squat", "wave"))
+    new = record_motions([squat, wave, squat], tmp_path, "org/dances/all:latest")
+    assert [path.name for path in new] == [
+        "squat.npz", "wave.npz", "squat-2.npz", "motions.json",
+    ]  # fmt: skip
+    assert record_motions([wave], tmp_path) == []
+    assert [path.name for path in recorded_motions(tmp_path)] == [p.name for p in new[:3]]
+    (tmp_path / "motion" / "wave.npz").write_bytes(squat.read_bytes())
+    with pytest.raises(MotionFileError, match="is missing or was changed since"):
+        recorded_motions(tmp_path)
+    (tmp_path / "motion" / "motions.json").write_text("{]")
+    with pytest.raises(MotionFileError, match="is damaged"):
+        recorded_motions(tmp_path)
+    assert recorded_motions(tmp_path / "elsewhere") == []
+
+
+def test_a_resumed_run_goes_on_as_the_uninterrupted_one(make_runner, tmp_path):
+    whole = make_runner(tmp_path / "whole")
+    whole.learn(4, init_at_random_ep_len=True)
+    first = make_runner(tmp_path / "first")
+    first.learn(2, init_at_random_ep_len=True)
+    resumed = make_runner(tmp_path / "resumed")
+    resumed.load(str(tmp_path / "first" / "model_1.pt"))
+    resumed.learn(4)
+    assert torch.equal(weights(resumed), weights(whole))
+    for name in ("time_steps", "motion_ids", "body_pos_relative_w"):
+        assert torch.equal(
+            getattr(resumed.motion_command, name), getattr(whole.motion_command, name)
+        )
+    assert torch.equal(resumed.motion_command.sampler.failed, whole.motion_command.sampler.failed)
+
+
+@pytest.mark.parametrize("num_envs", [6, 4])
+def test_a_resumed_run_remembers_where_the_robot_fails(make_runner, tmp_path, num_envs):
+    runner = make_runner(tmp_path / "run")
+    runner.motion_command.sampler.failed.copy_(torch.arange(11.0) / 10)
+    runner.save(str(tmp_path / "run" / "model_0.pt"))
+    resumed = make_runner(num_envs=num_envs)
+    resumed.load(str(tmp_path / "run" / "model_0.pt"))
+    torch.testing.assert_close(resumed.motion_command.sampler.failed, torch.arange(11.0) / 10)
+
+
+def test_statistics_of_another_motion_are_left_out(make_runner, tmp_path, caplog):
+    runner = make_runner(tmp_path / "run")
+    runner.save(str(tmp_path / "run" / "model_0.pt"))
+    other = make_runner(motion="squat")
+    other.load(str(tmp_path / "run" / "model_0.pt"))
+    assert other.motion_command.sampler.failed.sum() == 0
+    assert "start anew: they are of 11 segments, and the motions have 5" in caplog.text
+
+
+def test_a_run_at_wandb_uses_the_artifact_and_uploads_its_motions(
+    make_runner, tmp_path, monkeypatch
+):
+    calls = []
+    run = SimpleNamespace(use_artifact=lambda name: calls.append(("use", name)))
+    wandb = SimpleNamespace(
+        run=run, save=lambda path, base_path: calls.append((Path(path).name, Path(base_path).name))
+    )
+    monkeypatch.setitem(__import__("sys").modules, "wandb", wandb)
+    runner = make_runner(logger="wandb", registry_name="org/dances/squat", motion="squat")
+    for number in (0, 1):
+        runner.save(str(tmp_path / "run" / f"model_{number}.pt"))
+    assert calls == [
+        ("squat.npz", "run"), ("motions.json", "run"), ("use", "org/dances/squat:latest"),
+    ]  # fmt: skip
+    entries = json.loads((tmp_path / "run" / "motion" / "motions.json").read_text())
+    assert entries[0]["source"] == "org/dances/squat"
+
+
+def test_motions_that_cannot_be_recorded_cost_no_checkpoint(make_runner, tmp_path, caplog):
+    runner = make_runner()
+    runner.motion_command.motion_files = (tmp_path / "gone.npz",)
+    runner.save(str(tmp_path / "run" / "model_0.pt"))
+    assert (tmp_path / "run" / "model_0.pt").is_file()
+    assert (tmp_path / "run" / "run.onnx").is_file()
+    assert "The motions were not recorded" in caplog.text
+
+
+def test_a_task_without_motion_is_refused():
+    from mjlab.tasks.registry import load_env_cfg
+
+    cfg = load_env_cfg("Mjlab-Cartpole-Balance")
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    rl_cfg = asdict(load_rl_cfg("Mjlab-Cartpole-Balance"))
+    with pytest.raises(ValueError, match="needs a MotionCommand"):
+        MotionTrackingOnPolicyRunner(RslRlVecEnvWrapper(env), rl_cfg)
+    env.close()
