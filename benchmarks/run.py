@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import learning
-import locomotion
 import repeatability
 import startup
+import tasks
 import throughput
 from report import RESULTS, Row, show, write
 
 
 def main() -> None:
     rows: list[Row] = []
-    for benchmark in (throughput, locomotion, startup, repeatability, learning):
+    for benchmark in (throughput, tasks, startup, repeatability, learning):
         print(f"{benchmark.__name__} ...", flush=True)
         rows += benchmark.measure()
         # Written after each, so that a long run that is stopped has left what it measured.

@@ -1,6 +1,6 @@
 """Speed of whole tasks: `env.step` over a bare `mjbatch` loop of the same model.
 
-Those are the velocity tasks, and lifting a cube from the state.
+Those are the velocity tasks, lifting a cube from the state, and motion tracking.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from timing import BareLoop, alternate
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.tasks.registry import load_env_cfg
 
-NUM_ENVS = 1024
 NUM_THREADS = 2
 ACTION_SIZE = 0.3
 STEPS_BEFORE = 25
@@ -30,6 +29,7 @@ class Case:
     what: str
     to_reach: float
     with_rays: bool = False
+    num_envs: int = 1024
 
 
 CASES = (
@@ -37,6 +37,7 @@ CASES = (
     Case("Mjlab-Velocity-Flat-Unitree-G1", "G1 flat", 0.85),
     Case("Mjlab-Velocity-Rough-Unitree-Go1", "Go1 rough with its height scan", 0.75, True),
     Case("Mjlab-Lift-Cube-Yam", "Lift cube from state", 0.80),
+    Case("Mjlab-Tracking-Flat-Unitree-G1", "G1 tracking", 0.80, num_envs=512),
 )
 
 
@@ -70,13 +71,13 @@ def measure_case(case: Case) -> Row:
     randomized, and in each round starts from the states in which the environments are, with the same
     controls: what a robot does decides what its physics costs.
     """
-    env = make_env(case.task, NUM_ENVS)
+    env = make_env(case.task, case.num_envs)
     generator = torch.Generator().manual_seed(0)
-    shape = (NUM_ENVS, env.action_manager.total_action_dim)
+    shape = (case.num_envs, env.action_manager.total_action_dim)
     actions = ACTION_SIZE * torch.randn(shape, generator=generator)
     for _ in range(STEPS_BEFORE):
         env.step(actions)
-    bare = BareLoop(env.sim.mj_model, NUM_ENVS, NUM_THREADS, env.cfg.decimation)
+    bare = BareLoop(env.sim.mj_model, case.num_envs, NUM_THREADS, env.cfg.decimation)
     bare.expand({name: getattr(env.sim.model, name) for name in env.sim.expanded_fields})
 
     def same_states() -> None:
@@ -92,10 +93,10 @@ def measure_case(case: Case) -> Row:
     ratio = bare_time / env_time
     rays = ", same rays" if case.with_rays else ""
     return Row(
-        f"{case.what}, {NUM_ENVS} envs, native, {NUM_THREADS} threads: `env.step` over the bare "
+        f"{case.what}, {case.num_envs} envs, native, {NUM_THREADS} threads: `env.step` over the bare "
         f"loop{rays}",
-        f"{ratio:.2f} ({NUM_ENVS / env_time:,.0f} env-steps/s)",
-        f"bare `mjbatch` loop: {NUM_ENVS / bare_time:,.0f} env-steps/s",
+        f"{ratio:.2f} ({case.num_envs / env_time:,.0f} env-steps/s)",
+        f"bare `mjbatch` loop: {case.num_envs / bare_time:,.0f} env-steps/s",
         f"at least {case.to_reach:.2f}",
         ratio >= case.to_reach,
     )
