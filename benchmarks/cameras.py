@@ -2,11 +2,12 @@
 
 The scene is that of `Mjlab-Lift-Cube-Yam-Rgb`: the wrist camera of the YAM arm at 32 x 32 pixels,
 which sees the cube, the ground and the arm's collision shapes. The arms stand at random poses near
-home. All take turns in one run, so that their ratios hold on a machine that others use too:
+home. All take turns in one run, so that their ratios hold on a machine that others use too; and so does the CPU time of an image:
 
 - depth and segmentation, and colours as well, by `Simulation.render` (what `sim.sense()` calls);
 - the bare rays of `mjbatch`, one for each pixel against all geoms, which yield a depth and a geom;
-- MuJoCo's own offscreen renderer, an environment after another, where OpenGL is available.
+- MuJoCo's own offscreen renderer, an environment after another, where OpenGL is available: the same
+  two images, and colours as the model has them, with shadows.
 
 Run alone: `python benchmarks/cameras.py`, with the number of environments if not 512.
 """
@@ -16,6 +17,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from typing import Any
 
 import mjbatch
 import mujoco
@@ -31,11 +33,9 @@ from mjlab.viewer.errors import RenderingUnavailableError
 from mjlab.viewer.gl_context import open_renderer
 
 TASK, SENSOR, SIZE = "Mjlab-Lift-Cube-Yam-Rgb", "camera_d405", 32
-# What the issue asks for: images a second of two cores, and times MuJoCo's renderer in software.
+# Images a second of two cores that are to be reached.
 WANTED = {"depth and segmentation": 4000.0, "colours": 2500.0}
-WANTED_OVER_RENDERER = 100.0
-# The renderer is measured on so many environments of each turn.
-_RENDERER_IMAGES = 8
+REPEATS = 15
 
 
 class BareRays:
@@ -71,41 +71,69 @@ def _pixel_rays(fovy: float) -> torch.Tensor:
     return rays / rays.norm(dim=-1, keepdim=True)
 
 
-def renderer_of(sim: Simulation, camera_id: int) -> tuple[Callable[[], None] | None, str]:
-    """Return what renders some depth images by OpenGL, and what with; None and why not."""
-    try:
-        renderer = open_renderer(sim.mj_model, SIZE, SIZE)
-    except RenderingUnavailableError as error:
-        return None, str(error).splitlines()[0]
-    from OpenGL import GL
+class Renderers:
+    """MuJoCo's offscreen renderer, of one environment after another."""
 
-    # A current context is needed to ask.
-    data = mujoco.MjData(sim.mj_model)
-    renderer.update_scene(data, camera_id)
-    renderer.render()
-    name = (GL.glGetString(GL.GL_RENDERER) or b"unknown").decode()
-    renderer.enable_depth_rendering()
+    def __init__(self, sim: Simulation, camera_id: int) -> None:
+        from OpenGL import GL
 
-    def images() -> None:
-        for i in range(_RENDERER_IMAGES):
-            sim.copy_to_host(i, data)
-            mujoco.mj_kinematics(sim.mj_model, data)
-            mujoco.mj_camlight(sim.mj_model, data)
-            renderer.update_scene(data, camera_id)
+        self._sim, self._camera_id = sim, camera_id
+        self._data = mujoco.MjData(sim.mj_model)
+        self._renderer = open_renderer(sim.mj_model, SIZE, SIZE)
+        # A context is current, and can be asked, once something has been drawn.
+        self.colours(1)
+        self.name = (GL.glGetString(GL.GL_RENDERER) or b"unknown").decode()
+
+    def _pose(self, env: int) -> None:
+        self._sim.copy_to_host(env, self._data)
+        mujoco.mj_kinematics(self._sim.mj_model, self._data)
+        mujoco.mj_camlight(self._sim.mj_model, self._data)
+        self._renderer.update_scene(self._data, self._camera_id)
+
+    def colours(self, count: int) -> None:
+        """Render as the model has it, with shadows; their map is 8192 x 8192 pixels."""
+        for env in range(count):
+            self._pose(env)
+            self._renderer.render()
+
+    def depth_and_segmentation(self, count: int) -> None:
+        """Render the two, which are two images to it."""
+        renderer = self._renderer
+        for env in range(count):
+            self._pose(env)
+            renderer.enable_depth_rendering()
             renderer.render()
+            renderer.disable_depth_rendering()
+            renderer.enable_segmentation_rendering()
+            renderer.render()
+            renderer.disable_segmentation_rendering()
 
-    return images, name
 
-
-def main() -> None:
-    """Measure, and print one line for each."""
-    num_envs = int(sys.argv[1]) if len(sys.argv) > 1 else 512
+def build(num_envs: int) -> ManagerBasedRlEnv:
+    """Build the task, with arms near home."""
     cfg = load_env_cfg(TASK)
     cfg.scene.num_envs, cfg.seed, cfg.sim.engine = num_envs, 0, "native"
     env = ManagerBasedRlEnv(cfg, device="cpu")
     env.reset()
     for _ in range(20):
-        env.step(torch.randn(num_envs, 7) * 0.5)
+        env.step(0.5 * torch.randn(num_envs, 7))
+    return env
+
+
+def cpu_time(sample: Callable[[], Any]) -> float:
+    """Return the least CPU time of all threads, in microseconds, which others disturb less."""
+    times = []
+    for _ in range(REPEATS):
+        begin = time.process_time()
+        sample()
+        times.append(time.process_time() - begin)
+    return 1e6 * min(times)
+
+
+def main() -> None:
+    """Measure, and print one line for each."""
+    num_envs = int(sys.argv[1]) if len(sys.argv) > 1 else 512
+    env = build(num_envs)
     sim, sensor = env.sim, env.scene[SENSOR]
     groups, camera = sensor.view.geom_groups, sensor.camera_idx
     both, colours = (
@@ -113,31 +141,41 @@ def main() -> None:
         for types in (("depth", "segmentation"), ("rgb",))
     )
     bare = BareRays(sim, camera, groups)
-    rendered, name = renderer_of(sim, camera)
-    samples = [lambda: sim.render(both), lambda: sim.render(colours), bare]
-    counts = [num_envs, num_envs, num_envs]
-    names = ["depth and segmentation", "colours", "bare mjbatch.rays"]
-    if rendered is not None:
-        samples, counts = [*samples, rendered], [*counts, _RENDERER_IMAGES]
-        names.append("MuJoCo's renderer, depth")
-    begin = time.perf_counter()
-    times = alternate(*samples, steps=1, repeats=25, warm_up=2)
-    speeds = dict(zip(names, (n / t for n, t in zip(counts, times, strict=True)), strict=True))
-    same = (
-        sim.render(both)[0].segmentation[..., 0].reshape(num_envs, -1).numpy() == bare.geoms
-    ).mean()
-    print(f"{sim.capabilities.description}; {num_envs} environments, {SIZE} x {SIZE} pixels, "
-          f"{time.perf_counter() - begin:.0f} s, pixels as by bare rays: {100 * same:.2f} %")  # fmt: skip
-    print(f"OpenGL: {name}")
-    for what, speed in speeds.items():
-        over_rays = speed / speeds["bare mjbatch.rays"]
-        line = f"{what:26} {speed:8.0f} images/s  {over_rays:6.2f} x the bare rays"
-        if rendered is not None:
-            ratio = speed / speeds["MuJoCo's renderer, depth"]
-            line += f"  {ratio:7.1f} x MuJoCo's renderer"
-        print(line + (f"  (wanted: {WANTED[what]:.0f}/s)" if what in WANTED else ""))
-    if rendered is not None:
-        print(f"wanted: {WANTED_OVER_RENDERER:.0f} x MuJoCo's renderer in software")
+    samples: dict[str, tuple[Callable[[], Any], int]] = {
+        "depth and segmentation": (lambda: sim.render(both), num_envs),
+        "colours": (lambda: sim.render(colours), num_envs),
+        "bare mjbatch.rays": (bare, num_envs),
+    }
+    try:
+        renderers = Renderers(sim, camera)
+    except RenderingUnavailableError as error:
+        print(f"MuJoCo's renderer is left out: {str(error).splitlines()[0]}")
+    else:
+        print(f"OpenGL: {renderers.name}")
+        samples |= {
+            "renderer: depth and seg.": (lambda: renderers.depth_and_segmentation(8), 8),
+            "renderer: colours": (lambda: renderers.colours(1), 1),
+        }
+    parts = list(samples.values())
+    times = alternate(*(sample for sample, _ in parts), steps=1, repeats=REPEATS, warm_up=2)
+    speeds = {
+        name: count / time for (name, (_, count)), time in zip(samples.items(), times, strict=True)
+    }
+    ids = sim.render(both)[0].segmentation
+    assert ids is not None
+    same = (ids[..., 0].reshape(num_envs, -1).numpy() == bare.geoms).mean()
+    print(f"{sim.capabilities.description}; {num_envs} environments, {SIZE} x {SIZE} pixels")
+    print(f"pixels that show the geom which bare rays meet: {100 * same:.2f} %")
+    for name, speed in speeds.items():
+        sample, count = samples[name]
+        line = f"{name:26}{speed:9.1f} images/s{cpu_time(sample) / count:10.0f} us of CPU"
+        if name in WANTED:
+            line += f"{speed / speeds['bare mjbatch.rays']:7.1f} x bare rays"
+            for other in ("renderer: depth and seg.", "renderer: colours"):
+                if other in speeds:
+                    line += f"{speed / speeds[other]:9.1f} x {other}"
+            line += f"   (wanted: {WANTED[name]:.0f}/s)"
+        print(line)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ It renders offscreen and needs no display. Run it again when a terrain preset or
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -16,12 +16,15 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from mjlab.scene import Scene, SceneCfg
+from mjlab.sensor import CameraSensorCfg
 from mjlab.sim import Simulation, SimulationCfg
+from mjlab.tasks.registry import load_env_cfg
 from mjlab.terrains import SubTerrainCfg, TerrainEntityCfg, TerrainGenerator, TerrainGeneratorCfg
 from mjlab.terrains.config import ALL_TERRAIN_PRESETS
 from mjlab.viewer.gl_context import open_renderer
 from mjlab.viewer.offscreen_renderer import OffscreenRenderer
 from mjlab.viewer.viewer_config import ViewerConfig
+from mjlab.viewer.viser.camera_feeds import depth_colors, segmentation_colors
 
 _IMAGES = Path(__file__).parent / "images"
 
@@ -37,6 +40,67 @@ def main() -> None:
     """Draw all pictures."""
     draw_terrains(_IMAGES / "terrains.png")
     draw_variants(_IMAGES / "variants.png")
+    draw_cameras(_IMAGES / "cameras.png")
+
+
+def draw_cameras(path: Path) -> None:
+    """Draw what cameras of both engines see of the arm that lifts a cube, one engine a row."""
+    figure = Figure(figsize=(9.6, 3.4), dpi=100)
+    engines: tuple[Literal["native", "warp"], ...] = ("native", "warp")
+    for row, engine in enumerate(engines):
+        pictures = camera_pictures(engine)
+        for column, (title, pixels) in enumerate(pictures.items()):
+            left, width = (0.025 + 0.1625 * column, 0.158)
+            axes = figure.add_axes((left, 0.485 - 0.475 * row, width, 0.45), xticks=[], yticks=[])
+            axes.imshow(pixels, interpolation="nearest")
+            if row == 0:
+                axes.set_title(title, fontsize=9, pad=3)
+            if column == 0:
+                axes.set_ylabel(engine, fontsize=10, labelpad=4)
+    figure.savefig(path)
+    Image.open(path).convert("RGB").save(path, optimize=True)
+    print(f"{path}: {path.stat().st_size // 1024} kB")
+
+
+def camera_pictures(engine: Literal["native", "warp"]) -> dict[str, np.ndarray]:
+    """Return the images (H, W, 3) of two cameras, by what they show."""
+    task = load_env_cfg("Mjlab-Lift-Cube-Yam-Rgb").scene
+    kinds = ("rgb", "depth", "segmentation")
+    common: dict[str, Any] = {"width": 144, "height": 144, "data_types": kinds}
+    common["enabled_geom_groups"] = (0, 2)
+    look = {
+        # The arm from the side, with shadows, and what its own camera sees.
+        "side": CameraSensorCfg(
+            name="side", pos=(0.2, -0.85, 0.3), quat=(0.75, 0.66, 0.0, 0.0), fovy=50.0,
+            use_shadows=True, **common,
+        ),
+        "wrist": CameraSensorCfg(name="wrist", camera_name="robot/camera_d405", **common),
+    }  # fmt: skip
+    cfg = SceneCfg(
+        num_envs=1,
+        env_spacing=1.0,
+        terrain=task.terrain,
+        entities=task.entities,
+        sensors=tuple(look.values()),
+    )
+    scene = Scene(cfg, device="cpu")
+    sim = Simulation(1, SimulationCfg(engine=engine), spec=scene.spec, device="cpu")
+    scene.initialize(sim.mj_model, sim.model, sim.data)
+    sim.set_sensor_context(scene.sensor_context)
+    robot, cube = scene["robot"], scene["cube"]
+    robot.write_joint_state_to_sim(
+        robot.data.default_joint_pos, torch.zeros_like(robot.data.default_joint_pos)
+    )
+    cube.write_root_link_pose_to_sim(torch.tensor([[0.4, 0.0, 0.02, 0.95, 0.0, 0.0, 0.31]]))
+    sim.forward()
+    sim.sense()
+    pictures = {}
+    for name, white in (("side", 1.5), ("wrist", 0.5)):
+        data = scene[name].data
+        pictures[f"{name}: rgb"] = data.rgb[0].numpy()
+        pictures[f"{name}: depth"] = depth_colors(data.depth[0].numpy(), white)
+        pictures[f"{name}: segmentation"] = segmentation_colors(data.segmentation[0].numpy())
+    return pictures
 
 
 def draw_variants(path: Path) -> None:

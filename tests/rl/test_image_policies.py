@@ -325,6 +325,22 @@ def edited(**changes: Any) -> dict[str, Any]:
             {"critic__cnn_cfg": {**CNN_CFG, "kernel_size": (5, 33), "padding": "none"}},
             r"The critic's cnn_cfg makes no encoder for the images 'camera' of shape \(2, 16, 16\)",
         ),
+        (
+            {"settings": {"actor": ("actor", "camra")}},
+            r"obs_groups\['actor'\] names \['camra'\], and .*'camera'",
+        ),
+        ({"actor__cnn_cfg": "resnet"}, "The actor's cnn_cfg is 'resnet'; it has to be a dict"),
+        (
+            {
+                "actor__class_name": "CNNModel",
+                "actor__cnn_cfg": {**CNN_CFG, "spatial_softmax": True},
+            },
+            r"The actor's cnn_cfg has \['spatial_softmax'\], and class_name='CNNModel' has no",
+        ),
+        (
+            {"critic__cnn_cfg": {**CNN_CFG, "spatial_softmax_temperature": 0.0}},
+            "The critic's cnn_cfg has spatial_softmax_temperature=0.0",
+        ),
         ({"actor__cnn_cfg": {**CNN_CFG, "kernels": 3}}, "unexpected keyword argument 'kernels'"),
         (
             {"settings": {"critic": ("critic", "depth"), "share": True}},

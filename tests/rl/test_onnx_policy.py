@@ -108,8 +108,31 @@ def test_operators_and_inputs_that_are_not_known_are_named(tmp_path: Path) -> No
     two = graph(
         tmp_path / "2.onnx", [helper.make_node("Add", ["x", "h"], ["y"])], ["x", "h"], ["y"]
     )
-    with pytest.raises(OnnxPolicyError, match=r"inputs \['x', 'h'\]"):
+    with pytest.raises(OnnxPolicyError, match=r"depend on the inputs \['x', 'h'\]"):
         OnnxPolicy(two)
+    nodes = [helper.make_node("Relu", ["x"], [name]) for name in ("y", "z")]
+    several = graph(tmp_path / "s.onnx", nodes, ["x"], ["y", "z"])
+    with pytest.raises(OnnxPolicyError, match=r"outputs \['y', 'z'\], of which none is called 'a"):
+        OnnxPolicy(several)
+
+
+def test_only_what_the_actions_follow_from_is_computed(tmp_path: Path) -> None:
+    """Such as in files of motion tracking, which return the reference at another input."""
+    nodes = [
+        helper.make_node("LSTM", ["time_step"], ["frame"]),
+        helper.make_node("Relu", ["obs"], ["h"]),
+        helper.make_node("Neg", ["frame"], ["joint_pos"]),
+        helper.make_node("Tanh", ["h"], ["actions"]),
+    ]
+    path = graph(tmp_path / "p.onnx", nodes, ["time_step", "obs"], ["joint_pos", "actions"])
+    policy = OnnxPolicy(path)
+    rows = torch.randn(4, 2)
+    torch.testing.assert_close(policy(rows), rows.relu().tanh())
+    assert (policy.num_observations, policy.num_actions) == (2, 2)
+    mixed = [*nodes[:3], helper.make_node("Add", ["h", "time_step"], ["actions"])]
+    path = graph(tmp_path / "m.onnx", mixed, ["time_step", "obs"], ["joint_pos", "actions"])
+    with pytest.raises(OnnxPolicyError, match=r"depend on .*\['time_step', 'obs'\].*Play the che"):
+        OnnxPolicy(path)
 
 
 def test_numbers_of_three_decimals_are_like_the_full_ones_and_other_words_are_not() -> None:

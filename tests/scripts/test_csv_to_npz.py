@@ -261,11 +261,49 @@ def test_flags_that_make_no_sense_are_refused(csv, tmp_path, flags, message):
         convert(cfg)
 
 
+def test_lines_of_a_range_are_told_as_in_the_file(tmp_path):
+    path = tmp_path / "bad.csv"
+    path.write_text("\n".join([a_line()] * 6 + [a_line(c9=float("nan"))] + [a_line(c6=0.5)]))
+    cfg = CsvToNpzConfig(input_file=str(path), output_file=str(tmp_path / "o.npz"))
+    cfg.line_range = (3, 7)
+    with pytest.raises(MotionFileError, match="Line 7 of .* NaN"):
+        convert(cfg)
+    cfg.line_range = (8, 8)
+    with pytest.raises(MotionFileError, match="has 1 poses to read"):
+        convert(cfg)
+    path.write_text("\n".join([a_line()] * 6 + [a_line(c6=0.5)]))
+    cfg.line_range = (3, 7)
+    with pytest.raises(MotionFileError, match="in line 7 the norm is 0.5"):
+        convert(cfg)
+
+
+def test_a_recording_shorter_than_two_frames_is_told(csv, tmp_path):
+    cfg = CsvToNpzConfig(
+        input_file=str(csv), output_file=str(tmp_path / "o.npz"), line_range=(1, 2), output_fps=10.0
+    )
+    with pytest.raises(ValueError, match="2 poses at 30 per second make 1 at 10 per second"):
+        convert(cfg)
+
+
+def test_an_upload_that_fails_is_one_message_and_keeps_the_motion(csv, tmp_path, monkeypatch):
+    def init(project, name):
+        raise RuntimeError("No API key configured")
+
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
+    with pytest.raises(UserError, match="dance.npz cannot be uploaded .*No API key"):
+        converted(csv, tmp_path, upload=True)
+    assert read_motion(tmp_path / "out" / "dance.npz").num_frames == 150
+
+
 def test_the_input_is_not_overwritten(csv, tmp_path, monkeypatch):
     converted(csv, tmp_path)
     monkeypatch.chdir(tmp_path / "out")
     with pytest.raises(UserError, match="would overwrite the input"):
         convert(CsvToNpzConfig(input_file="dance.npz"))
+    before = Path("dance.npz").read_bytes()
+    with pytest.raises(UserError, match="would overwrite the input"):
+        convert(CsvToNpzConfig(input_file="dance.npz", output_file="dance", output_fps=25.0))
+    assert Path("dance.npz").read_bytes() == before
 
 
 def test_the_page_plays_the_motion_and_follows_the_slider(csv, tmp_path):

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+import torch
 
 from mjlab.scripts import demo
+from mjlab.scripts.policy import load_policy, make_env
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 
 HEADLESS = ("--viewer", "none", "--num-steps", "3", "--device", "cpu")
 
@@ -15,11 +19,6 @@ HEADLESS = ("--viewer", "none", "--num-steps", "3", "--device", "cpu")
 @pytest.fixture(scope="module")
 def go1_policy(tmp_path_factory) -> Path:
     """An exported policy of the demo's task that has not learned anything."""
-    from dataclasses import asdict
-
-    from mjlab.scripts.policy import make_env
-    from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
-
     env = make_env(demo.TASK, load_env_cfg(demo.TASK, play=True), "cpu", 1)
     cfg = load_rl_cfg(demo.TASK)
     cfg.actor.hidden_dims = cfg.critic.hidden_dims = (8,)
@@ -29,6 +28,11 @@ def go1_policy(tmp_path_factory) -> Path:
     finally:
         env.close()
     return path
+
+
+@pytest.fixture
+def go1_env_cfg():
+    return load_env_cfg(demo.TASK, play=True)
 
 
 def test_demo_plays_its_policy_without_being_told_anything(run, go1_policy, monkeypatch):
@@ -61,11 +65,31 @@ def test_help_is_short_and_loads_nothing(run):
 
 def test_a_bundled_policy_fits_the_task_and_says_how_it_was_made(run):
     assert (demo.POLICY.parent / "README.md").is_file()
-    if not demo.POLICY.is_file():
-        pytest.skip("the policy is not there yet")
     assert demo.POLICY.stat().st_size < 2_000_000
     outcome = run("demo", *HEADLESS)
     assert outcome.status == 0, outcome.err
+
+
+def test_the_bundled_policy_walks_forward_as_told(go1_env_cfg):
+    twist = go1_env_cfg.commands["twist"]
+    twist.rel_standing_envs = twist.rel_heading_envs = 0.0
+    twist.ranges.lin_vel_x, twist.ranges.lin_vel_y = (0.8, 0.8), (0.0, 0.0)
+    twist.ranges.ang_vel_z = (0.0, 0.0)
+    env = make_env(demo.TASK, go1_env_cfg, "cpu", 4, seed=0)
+    try:
+        policy = load_policy(demo.TASK, env, demo.POLICY, "cpu")
+        robot = env.unwrapped.scene["robot"].data
+        observations, _ = env.reset()
+        begin = robot.root_link_pos_w.clone()
+        with torch.inference_mode():
+            for _ in range(150):
+                observations, _, dones, _ = env.step(policy(observations))
+                assert not dones.any()
+        walked = (robot.root_link_pos_w - begin)[:, :2].norm(dim=-1)
+    finally:
+        env.close()
+    # Three seconds at 0.8 m/s are 2.4 m, less the time to get going.
+    assert ((walked > 1.8) & (walked < 2.8)).all()
 
 
 @pytest.mark.parametrize("script", ["play", "evaluate"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tempfile
 import zipfile
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import mujoco
 import pytest
 
 from mjlab.envs import ManagerBasedRlEnv
+from mjlab.scripts.cli import UserError
 from mjlab.scripts.export_scene import ExportSceneConfig, run_export_scene
 from mjlab.tasks.registry import load_env_cfg
 
@@ -56,6 +58,26 @@ def test_an_archive_is_written_on_request(run, tmp_path: Path) -> None:
     assert "robot.zip exists" in again.message
 
 
+def test_an_archive_of_the_folder_above_holds_the_scene_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "above" / "here").mkdir(parents=True)
+    (tmp_path / "above" / "thesis.txt").write_text("years of work")
+    monkeypatch.chdir(tmp_path / "above" / "here")
+    # Packed from a folder of temporary files, of which this is all that there is.
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "above"))
+    result = run_export_scene("go1", ExportSceneConfig(output_dir="..", zip=True))
+    assert result.resolve() == tmp_path / "above.zip"
+    with zipfile.ZipFile(result) as archive:
+        assert [n for n in archive.namelist() if not n.endswith("/")] == ["scene.xml"]
+    here = run_export_scene("go1", ExportSceneConfig(output_dir=".", zip=True))
+    assert here.resolve() == tmp_path / "above" / "here.zip"
+    named = run_export_scene("go1", ExportSceneConfig(output_dir="robot.zip", zip=True))
+    assert named == Path("robot.zip")
+    with pytest.raises(UserError, match="no name that an archive could have"):
+        run_export_scene("go1", ExportSceneConfig(output_dir="/", zip=True))
+
+
 def test_a_folder_with_files_is_left_alone(run, tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("years of work")
     outcome = run("export_scene", "go1", "--output-dir", str(tmp_path))
@@ -63,6 +85,15 @@ def test_a_folder_with_files_is_left_alone(run, tmp_path: Path) -> None:
     assert "is not empty" in outcome.message
     assert "--overwrite" in outcome.message
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_file_in_the_folders_place_is_left_alone(overwrite: bool, tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("years of work")
+    cfg = ExportSceneConfig(output_dir=str(tmp_path / "out"), overwrite=overwrite)
+    with pytest.raises(UserError, match="out is a file"):
+        run_export_scene("go1", cfg)
+    assert (tmp_path / "out").read_text() == "years of work"
 
 
 def test_overwriting_replaces_an_export_and_nothing_else(run, tmp_path: Path) -> None:
@@ -101,6 +132,8 @@ def test_a_function_of_another_module_makes_the_entity(
     assert [p.name for p in (tmp_path / "out" / "assets").rglob("*.obj")] == ["m.obj"]
     wrong = run("export_scene", "my_robot_7:NOTHING", "--output-dir", "other")
     assert "made a int" in wrong.message
+    asking = run("export_scene", "os:chdir", "--output-dir", "other")
+    assert "takes arguments" in asking.message
     missing = run("export_scene", "my_robot_7:absent", "--output-dir", "other")
     assert "cannot be imported" in missing.message
     assert not (tmp_path / "other").exists()

@@ -136,6 +136,18 @@ def test_a_model_that_is_missing_damaged_or_another_is_told(dump_file: Path) -> 
         load_dump(str(dump_file))
 
 
+def test_a_dump_that_is_damaged_or_says_too_little_is_told(dump_file: Path, tmp_path: Path) -> None:
+    content = dump_file.read_bytes()
+    dump, model = load_dump(str(dump_file))
+    dump_file.write_bytes(content[: len(content) // 2])
+    with pytest.raises(UserError, match="is damaged, or only in part here"):
+        load_dump(str(dump_file))
+    metadata = {name: dump.metadata[name] for name in ("model_file", "state_spec")}
+    np.savez(dump_file, _metadata=np.array(json.dumps(metadata)), **dump.arrays)
+    with pytest.raises(UserError, match=r"has no \['state_size'\]"):
+        load_dump(str(dump_file))
+
+
 def test_a_dump_without_states_is_told(tmp_path: Path) -> None:
     metadata = json.dumps({"model_file": "m.mjb"})
     np.savez(tmp_path / "empty.npz", _metadata=np.array(metadata))

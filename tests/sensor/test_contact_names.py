@@ -196,3 +196,16 @@ def test_a_name_that_the_scene_has_already_is_refused():
     cfg.name = "box/tick"
     with pytest.raises(ValueError, match=r"\['box/tick'\]"):
         compose(cfg, box=gyro)
+
+
+def test_of_many_names_a_few_are_listed():
+    boxes = "".join(f'<geom name="box_{k}" size=".1"/>' for k in range(200))
+    many = EntityCfg(
+        spec_fn=lambda: mujoco.MjSpec.from_string(
+            f'<mujoco><worldbody><body name="pile"><freejoint/>{boxes}</body></worldbody></mujoco>'
+        )
+    )
+    cfg = ContactSensorCfg(name="touch", primary=geom("nothing", "pile"))
+    with pytest.raises(ValueError, match="'box_2'] and 197 others") as caught:
+        Scene(SceneCfg(entities={"pile": many}, sensors=(cfg,)), "cpu")
+    assert len(str(caught.value)) < 400

@@ -311,8 +311,9 @@ def hilly():
     sims = [
         Simulation(2, SimulationCfg(engine="native"), model=model, device="cpu") for _ in range(2)
     ]
-    # Geoms that differ between environments are not sought by place.
-    sims[1].expand_model_fields(("geom_pos",))
+    # Geoms that are not as compiled are not sought by place. This one is turned as it was.
+    sims[1].expand_model_fields(("geom_quat",))
+    sims[1].model.geom_quat[:, 1] *= -1.0
     points = torch.zeros(2, 40, 3)
     points[..., 2] = 2.0
     for _ in range(2):
@@ -420,3 +421,69 @@ def test_geoms_that_a_randomization_has_moved_are_met_where_they_are():
     after = sim.raycast(origins, directions)[0]
     moved = torch.tensor([0.0, -0.1, 0.0])[:, None]
     torch.testing.assert_close(after, before + moved, atol=1e-5, rtol=0)
+
+
+def queries_of_everything(sim: Simulation, monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Return a list that grows whenever all geoms are tried, static ones included."""
+    calls: list[bool] = []
+    rays_of = sim._engine._rays
+    original = rays_of._cast_all
+
+    def spy(*args, static: bool = True, **kwargs):
+        if static:
+            calls.append(True)
+        return original(*args, static=static, **kwargs)
+
+    monkeypatch.setattr(rays_of, "_cast_all", spy)
+    return calls
+
+
+def test_randomizing_what_moves_leaves_the_ground_looked_up_by_place(monkeypatch, caplog):
+    model = terrain_model(turned=False, moving=True, hills=False)
+    sim = Simulation(3, SimulationCfg(engine="native"), model=model, device="cpu")
+    origins = torch.tensor([0.0, 0.0, 3.0]).repeat(3, 4, 1)
+    directions = torch.tensor(DOWN).repeat(3, 4, 1)
+    sim.raycast(origins, directions)
+    calls = queries_of_everything(sim, monkeypatch)
+    fields = ("geom_size", "geom_pos", "geom_rgba", "geom_friction", "body_pos", "geom_solref")
+    sim.expand_model_fields(fields)
+    ball = model.ngeom - 1
+    sim.model.geom_size[1, ball] = 0.3
+    sim.model.geom_pos[2, ball, 0] = 0.5
+    sim.model.geom_rgba[:, :, 0] = 0.1
+    sim.model.geom_rgba[0, ball, 3] = 0.0
+    sim.model.geom_friction[:] = 0.3
+    # Colours that differ make it a query of another kind, whose first call looks at everything.
+    everything = sim.raycast(origins, directions)
+    calls.clear()
+    near = sim.raycast(origins, directions)
+    assert calls == []
+    assert all(torch.equal(a, b) for a, b in zip(everything, near, strict=True))
+    distances, _, geoms = near
+    assert caplog.text == ""
+    # The first is transparent, the second large, and the third stands aside.
+    assert geoms[:, 0].eq(ball).tolist() == [False, True, False]
+    assert distances[1, 0] == pytest.approx(1.7)
+
+
+def test_a_ground_that_differs_is_found_by_trying_everything_and_said_once(monkeypatch, caplog):
+    model = terrain_model(turned=False, moving=True, hills=False)
+    sim = Simulation(3, SimulationCfg(engine="native"), model=model, device="cpu")
+    origins = torch.tensor([0.0, 0.0, 3.0]).repeat(3, 4, 1)
+    directions = torch.tensor(DOWN).repeat(3, 4, 1)
+    before = [sim.raycast(origins, directions)[0] for _ in range(2)][-1]
+    calls = queries_of_everything(sim, monkeypatch)
+    sim.raycast(origins, directions)
+    assert calls == []
+    sim.expand_model_fields(("geom_pos",))
+    sim.model.geom_pos[1, : model.ngeom - 1, 2] -= 0.1
+    with caplog.at_level("WARNING"):
+        after = [sim.raycast(origins, directions)[0] for _ in range(2)][-1]
+    assert len(calls) == 2
+    assert len(caplog.records) == 1
+    assert "'geom_pos' of geoms that never move" in caplog.text
+    torch.testing.assert_close(after[[0, 2]], before[[0, 2]])
+    # As it was compiled again.
+    sim.model.geom_pos.copy_(sim.get_default_field("geom_pos"))
+    sim.raycast(origins, directions)
+    assert len(calls) == 2

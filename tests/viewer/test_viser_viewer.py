@@ -306,3 +306,18 @@ def test_shapes_that_differ_between_environments_are_drawn_as_each_has_them(
     scene._variants._next_check = 0.0
     scene.draw(env.sim, None)
     assert [shape.envs for shape in scene._variants._shapes.values()] == [[0, 1, 2]]
+
+
+def test_a_shape_that_differs_is_found_behind_others_that_do_not(viser_server) -> None:
+    env = FakeEnv(2)
+    model = env.sim.mj_model
+    pole = next(i for i in range(model.ngeom) if model.geom(i).name.startswith("cartpole/pole"))
+    rgba = torch.as_tensor(model.geom_rgba).float().expand(2, -1, -1).clone()
+    rgba[1, pole, :3] = 0.9
+    env.sim.expand("geom_rgba", rgba)
+    scene = MjlabViserScene(viser_server, model, 2)
+    # Its batch is the last one.
+    scene._mesh_groups.sort(key=lambda batch: model.geom_bodyid[pole] in batch.body_ids)
+    assert len(scene._mesh_groups) > 1
+    scene.draw(env.sim, None)
+    assert [shape.envs for shape in scene._variants._shapes.values()] == [[0], [1]]

@@ -61,6 +61,9 @@ class FakeSim:
         fields["time"] = torch.tensor([d.time for d in self.datas])
         return SimpleNamespace(**fields)
 
+    def sense(self) -> None:
+        pass
+
     def forward(self) -> None:
         for data in self.datas:
             mujoco.mj_forward(self.mj_model, data)
@@ -135,6 +138,9 @@ class FakeEnv:
         )
         self.reward_manager = FakeTerms({"upright": 0.5, "effort": -0.25})
         self.metrics_manager = FakeTerms({"height": 1.0})
+        self.observation_manager = SimpleNamespace(
+            reset=lambda env_ids: None, compute=lambda **kwargs: self.sim.data.qpos
+        )
         self.command_manager = FakeTerms({"velocity": 0.0})
         self.manager_visualizers = {"command_manager": self.command_manager}
         self.sensor_visualizers = SensorSwitches(

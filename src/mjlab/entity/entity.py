@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 
@@ -33,6 +33,9 @@ from mjlab.utils.lab_api.string import resolve_matching_names
 from mjlab.utils.spec import auto_wrap_fixed_base_mocap
 from mjlab.utils.state import stateful
 from mjlab.utils.xml import fix_spec_xml, strip_buffer_textures
+
+if TYPE_CHECKING:
+    from mjlab.entity.variants import VariantMetadata
 
 
 @dataclass
@@ -227,8 +230,8 @@ class Entity(NamedElements, EntityCommands):
         return any(actuator.transmission_type == transmission for actuator in self._actuators)
 
     @property
-    def variant_metadata(self) -> None:
-        """Meshes that differ between environments: this entity has none."""
+    def variant_metadata(self) -> VariantMetadata | None:
+        """What differs between environments; None unless built from a `VariantEntityCfg`."""
         return None
 
     @property
@@ -275,7 +278,7 @@ class Entity(NamedElements, EntityCommands):
             device: Torch device of the fields.
         """
         indexing = build_indexing(self._spec, self._free_joint, self.is_actuated, mj_model, device)
-        self._data = make_data(self, indexing, mj_model, model, data, device)
+        self._data = make_data(self, indexing, model, data, device)
         for actuator in self._actuators:
             actuator.initialize(mj_model, model, data, device)
         self._builtin_group, others = BuiltinActuatorGroup.process(self._actuators)

@@ -193,11 +193,11 @@ _SPECIAL = ("bodies", "joints")
 
 def element_ids(model: mujoco.MjModel, kind: str, elements: Iterable[Any]) -> list[int]:
     """Return the ids of spec elements in `model`: by name, or by spec order without a name."""
-    return [_element_id(model, kind, element) for element in elements]
+    return [element_id(model, _OBJECT_TYPES[kind], element) for element in elements]
 
 
-def _element_id(model: mujoco.MjModel, kind: str, element: Any) -> int:
-    object_type = _OBJECT_TYPES[kind]
+def element_id(model: mujoco.MjModel, object_type: mujoco.mjtObj, element: Any) -> int:
+    """Return the id of a spec element in `model`: by name, or by spec order without a name."""
     what = object_type.name.removeprefix("mjOBJ_").lower()
     if element.name:
         found = mujoco.mj_name2id(model, object_type, element.name)

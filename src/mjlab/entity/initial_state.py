@@ -117,8 +117,12 @@ def add_key(spec: mujoco.MjSpec, states: list[InitialState]) -> None:
 
 
 def short_name(name: str) -> str:
-    """Return the part of an element's name after the last '/', which is its name in its entity."""
-    return name.rsplit("/", 1)[-1]
+    """Return the part of an element's name after the last '/', which is its name in its entity.
+
+    Names that merged variants give to geoms are kept whole: their last part is but a number.
+    """
+    _, merged, rest = name.partition("mjlab/pad/")
+    return merged + rest if merged else name.rsplit("/", 1)[-1]
 
 
 def _reference(joint: mujoco.MjsJoint) -> list[float]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import mujoco
 import torch
 
 from mjlab.entity.data import EntityData
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
 def make_data(
     entity: Entity,
     indexing: EntityIndexing,
-    mj_model: mujoco.MjModel,
     model: Any,
     data: Any,
     device: str,
@@ -36,7 +34,7 @@ def make_data(
 
     articulation = entity.cfg.articulation
     factor = 1.0 if articulation is None else articulation.soft_joint_pos_limit_factor
-    limits = _joint_limits(mj_model, indexing)
+    limits = _joint_limits(model, indexing)
     num_tendons = len(indexing.tendons) if entity.has_tendon_actuators else 0
     return EntityData(
         indexing=indexing,
@@ -46,9 +44,9 @@ def make_data(
         default_root_state=row(entity.initial_state.root_state),
         default_joint_pos=row(entity.initial_state.joint_pos),
         default_joint_vel=row(entity.initial_state.joint_vel),
-        default_joint_pos_limits=row(limits),
-        joint_pos_limits=row(limits),
-        soft_joint_pos_limits=row(_shrunk(limits, factor)),
+        default_joint_pos_limits=limits,
+        joint_pos_limits=limits.clone(),
+        soft_joint_pos_limits=_shrunk(limits, factor),
         gravity_vec_w=row((0.0, 0.0, -1.0)),
         forward_vec_b=row((1.0, 0.0, 0.0)),
         is_fixed_base=entity.is_fixed_base,
@@ -65,19 +63,20 @@ def make_data(
     )
 
 
-def _joint_limits(mj_model: mujoco.MjModel, indexing: EntityIndexing) -> torch.Tensor:
-    """Return (nj, 2) limits, infinite where the compiled joint is not limited."""
-    ids = indexing.joint_ids.tolist()
-    limits = torch.tensor(mj_model.jnt_range[ids], dtype=torch.float32).reshape(-1, 2)
-    limited = torch.tensor(mj_model.jnt_limited[ids] != 0).reshape(-1)
-    limits[~limited, 0] = -torch.inf
-    limits[~limited, 1] = torch.inf
+def _joint_limits(model: Any, indexing: EntityIndexing) -> torch.Tensor:
+    """Return (N, nj, 2) limits, infinite where the compiled joint is not limited."""
+    ids = indexing.joint_ids.long()
+    # Read from the simulation, because variants of an entity may have limits of their own.
+    limits = model.jnt_range[:, ids].clone().float()
+    limited = model.jnt_limited[:, ids].bool()
+    limits[..., 0].masked_fill_(~limited, -torch.inf)
+    limits[..., 1].masked_fill_(~limited, torch.inf)
     return limits
 
 
 def _shrunk(limits: torch.Tensor, factor: float) -> torch.Tensor:
     """Return limits scaled by `factor` about their middle; infinite ones stay so."""
-    middle = limits.mean(dim=1)
-    half = 0.5 * factor * (limits[:, 1] - limits[:, 0])
-    shrunk = torch.stack((middle - half, middle + half), dim=1)
+    middle = limits.mean(dim=-1)
+    half = 0.5 * factor * (limits[..., 1] - limits[..., 0])
+    shrunk = torch.stack((middle - half, middle + half), dim=-1)
     return torch.where(torch.isinf(limits), limits, shrunk)

@@ -43,7 +43,12 @@ def _check_model(
 ) -> tuple[str, ...] | None:
     """Check one network; return the image groups that it encodes, None without encoders."""
     given = (cfg.get("obs_groups") or {}).get(model, (model,))
-    # What is not there is refused by rsl_rl, which lists what is.
+    missing = [name for name in given if name not in observations]
+    if missing and model in (cfg.get("obs_groups") or {}):
+        raise ValueError(
+            f"obs_groups[{model!r}] names {missing}, and the observation groups of the environment "
+            f"are {sorted(observations.keys())}."
+        )
     groups = {name: observations[name] for name in given if name in observations}
     for name, value in groups.items():
         _check_group(name, value)
@@ -58,7 +63,8 @@ def _check_model(
                 f"obs_groups[{model!r}]."
             )
         if model != "critic" or not shared:
-            _check_encoders(model, cfg[model].get("cnn_cfg"), {n: groups[n] for n in images})
+            cnn_cfg = cfg[model].get("cnn_cfg")
+            _check_encoders(model, kind, cnn_cfg, {n: groups[n] for n in images})
         return images
     # Models of other packages may take what they like.
     if images and getattr(kind, "_get_obs_dim", None) is MLPModel._get_obs_dim:
@@ -90,9 +96,11 @@ def _check_group(name: str, value: Any) -> None:
         )
 
 
-def _check_encoders(model: str, cnn_cfg: Any, images: dict[str, torch.Tensor]) -> None:
+def _check_encoders(model: str, kind: type, cnn_cfg: Any, images: dict[str, torch.Tensor]) -> None:
     if not cnn_cfg:
         raise ValueError(f"The {model} sees images {list(images)} and has no cnn_cfg. {_EXAMPLE}")
+    if not isinstance(cnn_cfg, dict):
+        raise ValueError(f"The {model}'s cnn_cfg is {cnn_cfg!r}; it has to be a dict. {_EXAMPLE}")
     by_group = all(isinstance(value, dict) for value in cnn_cfg.values())
     if by_group and set(cnn_cfg) != set(images):
         raise ValueError(
@@ -101,6 +109,7 @@ def _check_encoders(model: str, cnn_cfg: Any, images: dict[str, torch.Tensor]) -
         )
     for name, value in images.items():
         own = cnn_cfg[name] if by_group else cnn_cfg
+        _check_spatial_softmax(model, kind, own)
         settings = {k: v for k, v in own.items() if k not in _SPATIAL_SOFTMAX_KEYS}
         try:
             # On the meta device nothing is computed and no random number is drawn.
@@ -114,6 +123,21 @@ def _check_encoders(model: str, cnn_cfg: Any, images: dict[str, torch.Tensor]) -
                 f"{tuple(value.shape[1:])}: {str(error).splitlines()[0]}. The settings are "
                 f"{settings}; images have to be large enough for all layers."
             ) from error
+
+
+def _check_spatial_softmax(model: str, kind: type, settings: dict[str, Any]) -> None:
+    extra = [name for name in _SPATIAL_SOFTMAX_KEYS if name in settings]
+    if extra and kind is CNNModel:
+        raise ValueError(
+            f"The {model}'s cnn_cfg has {extra}, and class_name='CNNModel' has no spatial softmax. "
+            "Take them out, or use class_name='mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel'."
+        )
+    temperature = settings.get("spatial_softmax_temperature", 1.0)
+    if not (isinstance(temperature, (int, float)) and temperature > 0.0):
+        raise ValueError(
+            f"The {model}'s cnn_cfg has spatial_softmax_temperature={temperature!r}; it has to be a "
+            "positive number."
+        )
 
 
 def _check_sharing(images: Mapping[str, tuple[str, ...] | None]) -> None:

@@ -3,11 +3,16 @@
 So no ONNX runtime has to be installed, and one file plays in any number of environments, although
 it is exported for one. It covers networks of fully connected layers and of image encoders.
 Recurrent ones are refused; their checkpoints can be played.
+
+Only what the actions follow from is computed. A file may have further outputs, and inputs that these
+depend on: exported policies of motion tracking return the reference at an input `time_step`, which is
+of use on a robot, and which an environment has itself.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,6 +46,7 @@ _INTERFACE = (
     "default_joint_pos",
     "step_dt",
 )
+_ACTIONS = "actions"
 _RELATIVE_TOLERANCE = 0.01
 _ABSOLUTE_TOLERANCE = 6e-4
 
@@ -84,9 +90,9 @@ class OnnxPolicy(torch.nn.Module):
             device: Torch device to compute on.
 
         Raises:
-            OnnxPolicyError: the file is missing, no ONNX file, has other inputs than a flat
-                observation and images, has more than one output, or an operator that is not known
-                here.
+            OnnxPolicyError: the file is missing, no ONNX file, has no output that is called
+                `actions` nor only one; or the actions depend on other inputs than a flat
+                observation and images, or on an operator that is not known here.
         """
         super().__init__()
         self.path = Path(path)
@@ -96,13 +102,18 @@ class OnnxPolicy(torch.nn.Module):
         self._names: dict[str, str] = {}
         # Sizes and axes, which stay on the CPU, where they are looked at.
         self._integers: dict[str, torch.Tensor] = {}
+        output = self._find_output(model.graph)
+        nodes, needed = _leading_to(output.name, model.graph.node)
         for initializer in model.graph.initializer:
-            self._add_constant(initializer.name, tensor_value(initializer))
-        self._state, self.num_observations, self.image_shapes = self._read_inputs(model.graph)
-        self._output = model.graph.output[0].name
-        self.num_actions = _dims(model.graph.output[0])[-1]
-        self._steps = [self._read(node) for node in model.graph.node]
-        kinds = {node.op_type for node in model.graph.node}
+            if initializer.name in needed:
+                self._add_constant(initializer.name, tensor_value(initializer))
+        self._state, self.num_observations, self.image_shapes = self._read_inputs(
+            model.graph, needed
+        )
+        self._output = output.name
+        self.num_actions = _dims(output)[-1]
+        self._steps = [self._read(node) for node in nodes]
+        kinds = {node.op_type for node in nodes}
         self._is_row_wise = not self.image_shapes and kinds <= set(ROW_WISE)
         if not self._is_row_wise:
             self._compute_sizes()
@@ -208,19 +219,32 @@ class OnnxPolicy(torch.nn.Module):
                 self._integers[step.output] = value
         self._steps = remaining
 
-    def _read_inputs(self, graph: Any) -> tuple[str | None, int, dict[str, tuple[int, ...]]]:
-        """Return the name and size of the flat input, and the shapes of images by name."""
-        known = {*self._names, *self._integers}
-        dims = {item.name: _dims(item) for item in graph.input if item.name not in known}
+    def _find_output(self, graph: Any) -> Any:
+        outputs = {item.name: item for item in graph.output}
+        if _ACTIONS not in outputs and len(outputs) != 1:
+            raise OnnxPolicyError(
+                f"The policy {self.path} has the outputs {list(outputs)}, of which none is called "
+                f"{_ACTIONS!r}. Play the checkpoint (model_<iteration>.pt) instead."
+            )
+        return outputs.get(_ACTIONS, graph.output[0])
+
+    def _read_inputs(
+        self, graph: Any, needed: set[str]
+    ) -> tuple[str | None, int, dict[str, tuple[int, ...]]]:
+        """Return the name and size of the flat input, and the shapes of images by name.
+
+        Of the inputs, only those among `needed` are looked at.
+        """
+        asked = needed - {*self._names, *self._integers}
+        dims = {item.name: _dims(item) for item in graph.input if item.name in asked}
         flat = [name for name, size in dims.items() if len(size) == 2]
         images = {name: tuple(size[1:]) for name, size in dims.items() if len(size) == 4}
         understood = len(flat) <= 1 and len(flat) + len(images) == len(dims) > 0
-        if not understood or len(graph.output) != 1:
+        if not understood:
             raise OnnxPolicyError(
-                f"The policy {self.path} has the inputs {list(dims)} of sizes "
-                f"{list(dims.values())} and the outputs {[item.name for item in graph.output]}; "
-                "one flat input, any number of images and one output can be played here. Play "
-                "the checkpoint (model_<iteration>.pt) instead."
+                f"The actions of the policy {self.path} depend on the inputs {list(dims)} of sizes "
+                f"{list(dims.values())}; one flat input and any number of images can be played "
+                "here. Play the checkpoint (model_<iteration>.pt) instead."
             )
         state = flat[0] if flat else None
         return state, 0 if state is None else dims[state][-1], images
@@ -271,6 +295,17 @@ def _load(path: Path) -> Any:
     if not model.graph.node:
         raise OnnxPolicyError(f"{path} is not an ONNX file that can be read: it has no graph.")
     return model
+
+
+def _leading_to(output: str, nodes: Sequence[Any]) -> tuple[list[Any], set[str]]:
+    """Return the nodes from which `output` follows, in order, and the names of all that they read."""
+    needed, kept = {output}, []
+    # The nodes of a graph are in the order in which they are computed.
+    for node in reversed(nodes):
+        if needed.intersection(node.output):
+            needed.update(name for name in node.input if name)
+            kept.append(node)
+    return kept[::-1], needed
 
 
 def _dims(value: Any) -> list[int]:

@@ -22,7 +22,14 @@ from mjlab.scene.options import (
     resolve_mujoco_cfg,
     write_requests,
 )
-from mjlab.sensor import BuiltinSensor, RayCastSensor, Sensor, SensorCfg, SensorContext
+from mjlab.sensor import (
+    BuiltinSensor,
+    CameraSensor,
+    RayCastSensor,
+    Sensor,
+    SensorCfg,
+    SensorContext,
+)
 from mjlab.terrains.terrain_entity import TerrainEntity, TerrainEntityCfg
 from mjlab.utils.spec import export_spec, make_asset_paths_absolute
 from mjlab.utils.state import stateful
@@ -210,7 +217,7 @@ class Scene:
 
     @property
     def sensor_context(self) -> SensorContext | None:
-        """What evaluates ray sensors, once the scene is initialized; None if it has none."""
+        """What evaluates camera and ray sensors, once initialized; None if there are none."""
         return self._sensor_context
 
     @property
@@ -258,8 +265,11 @@ class Scene:
         for part in (*self._entities.values(), *self._sensors.values()):
             part.initialize(mj_model, model, data, self._device)
         rays = [sensor for sensor in self._sensors.values() if isinstance(sensor, RayCastSensor)]
-        if rays:
-            self._sensor_context = SensorContext(mj_model, model, data, [], rays, self._device)
+        cameras = [sensor for sensor in self._sensors.values() if isinstance(sensor, CameraSensor)]
+        if rays or cameras:
+            self._sensor_context = SensorContext(
+                mj_model, model, data, cameras, rays, self._device
+            )
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Reset targets, delays, histories and sensors of environments; None means all."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from mjlab.scripts.cli import UserError, tell
 from mjlab.tasks.tracking.motion_csv import read_csv
-from mjlab.tasks.tracking.motion_file import Motion, read_motion, write_motion
+from mjlab.tasks.tracking.motion_file import Motion, npz_path, read_motion, write_motion
 from mjlab.tasks.tracking.motion_kinematics import (
     Recording,
     make_motion,
@@ -77,7 +77,7 @@ def convert(cfg: CsvToNpzConfig) -> Path:
     robot = _robot(cfg.robot)
     source = Path(cfg.input_file)
     name = cfg.output_name or source.stem
-    target = Path(cfg.output_file) if cfg.output_file else Path(f"{name}.npz")
+    target = npz_path(cfg.output_file or f"{name}.npz")
     if target.resolve() == source.resolve():
         raise UserError(f"The output {target} would overwrite the input; give --output-file.")
     recording = _read(cfg, source, robot)
@@ -189,7 +189,20 @@ def pose(model: mujoco.MjModel, data: mujoco.MjData, motion: Motion, frame: int)
 
 
 def _upload(path: Path, name: str) -> None:
-    """Upload a motion as an artifact, and link it into the registry of motions."""
+    """Upload a motion as an artifact, and link it into the registry of motions.
+
+    Raises:
+        UserError: Weights & Biases does not take it.
+    """
+    try:
+        _send(path, name)
+    except Exception as error:
+        # wandb raises errors of many kinds, of its own and of what it is built on.
+        raise UserError(f"{path} cannot be uploaded to Weights & Biases: {error}") from error
+    tell(f"Uploaded as wandb-registry-{_ARTIFACT_TYPE}/{name}.")
+
+
+def _send(path: Path, name: str) -> None:
     import wandb
 
     run = wandb.init(project=_WANDB_PROJECT, name=name)
@@ -200,4 +213,3 @@ def _upload(path: Path, name: str) -> None:
         run.link_artifact(logged, target_path=f"wandb-registry-{_ARTIFACT_TYPE}/{name}")
     finally:
         run.finish()
-    tell(f"Uploaded as wandb-registry-{_ARTIFACT_TYPE}/{name}.")

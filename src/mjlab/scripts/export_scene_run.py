@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import os
 import sys
 import tempfile
@@ -47,7 +48,7 @@ def run_export_scene(target: str, cfg: ExportSceneConfig) -> Path:
         UserError: an unknown target, or a place that is taken.
     """
     scene_cfg, options = _load(target)
-    folder = Path(cfg.output_dir)
+    folder = _folder(cfg)
     result = folder.with_name(folder.name + ".zip") if cfg.zip else folder
     _check_place(result, cfg)
     scene = _build(scene_cfg, options)
@@ -68,7 +69,23 @@ def _build(scene_cfg: SceneCfg, options: MujocoCfg) -> Scene:
     return scene
 
 
+def _folder(cfg: ExportSceneConfig) -> Path:
+    folder = Path(cfg.output_dir)
+    if not cfg.zip:
+        return folder
+    if folder.suffix == ".zip":
+        return folder.with_suffix("")
+    # An archive needs a name, which these paths do not say: `.`, `..`, `/`.
+    if folder.name in ("", ".."):
+        folder = folder.resolve()
+    if not folder.name:
+        raise UserError(f"--output-dir {cfg.output_dir} has no name that an archive could have.")
+    return folder
+
+
 def _check_place(result: Path, cfg: ExportSceneConfig) -> None:
+    if not cfg.zip and result.exists() and not result.is_dir():
+        raise UserError(f"{result} is a file. Choose another --output-dir.")
     if cfg.overwrite or not result.exists():
         return
     if result.is_dir() and not any(result.iterdir()):
@@ -116,6 +133,17 @@ def _load(target: str) -> tuple[SceneCfg, MujocoCfg]:
     return env_cfg.scene, env_cfg.sim.mujoco
 
 
+def _needs_arguments(make: Callable[..., Any]) -> bool:
+    try:
+        inspect.signature(make).bind()
+    except TypeError:
+        return True
+    except ValueError:
+        # Functions of other languages may not tell.
+        return False
+    return False
+
+
 def _from_function(target: str) -> EntityCfg:
     from mjlab.entity import EntityCfg
 
@@ -127,6 +155,11 @@ def _from_function(target: str) -> EntityCfg:
         make = getattr(importlib.import_module(module_name), name)
     except (ImportError, AttributeError, ValueError) as error:
         raise UserError(f"{target!r} cannot be imported: {error}.") from error
+    if callable(make) and _needs_arguments(make):
+        raise UserError(
+            f"{target!r} takes arguments, and export-scene takes functions that return an EntityCfg "
+            "without any."
+        )
     made = make() if callable(make) else make
     if not isinstance(made, EntityCfg):
         raise UserError(

@@ -17,6 +17,7 @@ from mjlab.scripts.policy import (
     make_env,
     make_policy,
 )
+from mjlab.scripts.run_folder import is_run_folder
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -148,7 +149,9 @@ def _record(
 ) -> None:
     from mjlab.scripts.record import VideoCfg, record_policy
 
-    folder = Path("videos") if checkpoint is None else checkpoint.parent / "videos" / "play"
+    folder = Path("videos")
+    if checkpoint is not None and is_run_folder(checkpoint.parent):
+        folder = checkpoint.parent / "videos" / "play"
     record_policy(
         task,
         env_cfg,

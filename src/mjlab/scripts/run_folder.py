@@ -84,6 +84,11 @@ def write_run_info(run_dir: Path, **info: Any) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def is_run_folder(folder: Path) -> bool:
+    """Return whether training made `folder`, rather than somebody who keeps policies in it."""
+    return (folder / _INFO_FILE).is_file() or (folder / "params").is_dir()
+
+
 def read_run_info(run_dir: Path) -> dict[str, Any]:
     """Return what `run_dir` says about its run; nothing if it says nothing readable."""
     try:

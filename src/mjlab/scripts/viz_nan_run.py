@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import dataclass
 
 import mujoco
@@ -50,6 +51,8 @@ def load_dump(path: str) -> tuple[NanDump, mujoco.MjModel]:
     """
     try:
         dump = NanDump.load(path)
+    except zipfile.BadZipFile as error:
+        raise UserError(f"The dump {path} is damaged, or only in part here: {error}.") from error
     except FileNotFoundError:
         raise UserError(
             f"There is no dump {path}. `train --enable-nan-guard True` writes one when a NaN "
@@ -69,6 +72,9 @@ def load_dump(path: str) -> tuple[NanDump, mujoco.MjModel]:
             f"The model {dump.model_file} cannot be read by MuJoCo {mujoco.__version__}; it has to "
             f"be the version that wrote it. {error}"
         ) from error
+    missing = [name for name in ("state_spec", "state_size") if name not in dump.metadata]
+    if missing:
+        raise UserError(f"{path} is not a NaN dump of this version of mjlab: it has no {missing}.")
     size = mujoco.mj_stateSize(model, dump.metadata["state_spec"])
     if size != dump.metadata["state_size"]:
         raise UserError(

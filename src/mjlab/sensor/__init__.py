@@ -3,6 +3,9 @@
 from mjlab.sensor.builtin_sensor import BuiltinSensor as BuiltinSensor
 from mjlab.sensor.builtin_sensor import BuiltinSensorCfg as BuiltinSensorCfg
 from mjlab.sensor.builtin_sensor import ObjRef as ObjRef
+from mjlab.sensor.camera_sensor import CameraSensor as CameraSensor
+from mjlab.sensor.camera_sensor import CameraSensorCfg as CameraSensorCfg
+from mjlab.sensor.camera_sensor import CameraSensorData as CameraSensorData
 from mjlab.sensor.contact_sensor import ContactData as ContactData
 from mjlab.sensor.contact_sensor import ContactMatch as ContactMatch
 from mjlab.sensor.contact_sensor import ContactSensor as ContactSensor

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from mjlab.utils.string import compile_pattern
+from mjlab.utils.string import compile_pattern, name_list
 
 if TYPE_CHECKING:
     import mujoco
@@ -69,7 +69,7 @@ def find_matches(
     if not kept:
         raise ValueError(
             f"{where}: exclude={match.exclude!r} leaves nothing of what {match.pattern!r} matches: "
-            f"{[one.name for one in found]}."
+            f"{name_list([one.name for one in found], near=())}."
         )
     return kept
 
@@ -87,7 +87,7 @@ def _find_literal(where: str, match: ContactMatch, scene_spec: mujoco.MjSpec) ->
             raise ValueError(
                 f"{where} names the {match.mode} {name!r}, which the scene does not have. Without "
                 f"ContactMatch.entity, a name is taken literally.{_close_names(name, names)} "
-                f"It has: {names}."
+                f"It has: {name_list(names, near=())}."
             )
     if len(set(match.patterns)) != len(match.patterns):
         raise ValueError(f"{where} names an element twice: {match.pattern!r}.")
@@ -107,7 +107,7 @@ def _matched_by_patterns(
             raise ValueError(
                 f"{where} pattern {pattern!r} matches none of the {_KINDS[match.mode]} of entity "
                 f"{match.entity!r}. A pattern must match a whole name."
-                f"{_close_names(pattern, names)} It has: {names}."
+                f"{_close_names(pattern, names)} It has: {name_list(names, near=())}."
             )
         for candidate in matching:
             if candidate in owners:

@@ -1,4 +1,4 @@
-"""What evaluates ray sensors together: one query of the engine for all that see the same geoms."""
+"""What evaluates camera and ray sensors, with as few queries of the engine as possible."""
 
 from __future__ import annotations
 
@@ -8,18 +8,26 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import torch
 
+from mjlab.sensor._camera_checks import check_shared_cameras
+
 if TYPE_CHECKING:
+    from mjlab.sensor.camera_sensor import CameraSensor
     from mjlab.sensor.raycast_sensor import RayCastSensor
+    from mjlab.sim.rendering import CameraView, Images
 
 RayCast = Callable[..., tuple[torch.Tensor, torch.Tensor, torch.Tensor]]
 """`Simulation.raycast`: origins, directions, geom groups, excluded bodies, reach of each ray."""
 
+Render = Callable[[tuple["CameraView", ...]], list["Images"]]
+"""`Simulation.render`: views to images."""
+
 
 class SensorContext:
-    """Evaluates the ray sensors of a scene, when `Simulation.sense` calls `sense`.
+    """Evaluates the camera and ray sensors of a scene, when `Simulation.sense` calls `sense`.
 
-    Sensors that see the same geom groups share one buffer and one query, whatever their patterns,
-    reaches and excluded bodies.
+    Ray sensors that see the same geom groups share one buffer and one query, whatever their
+    patterns, reaches and excluded bodies. All cameras are one query, and each keeps geom groups,
+    textures and shadows for itself.
     """
 
     def __init__(
@@ -27,7 +35,7 @@ class SensorContext:
         mj_model: mujoco.MjModel,
         model: Any,
         data: Any,
-        camera_sensors: list[Any],
+        camera_sensors: list[CameraSensor],
         raycast_sensors: Sequence[RayCastSensor],
         device: str,
     ) -> None:
@@ -37,12 +45,17 @@ class SensorContext:
             mj_model: The compiled model.
             model: The simulation's model fields.
             data: The simulation's data fields.
-            camera_sensors: Camera sensors; there are none yet.
+            camera_sensors: Camera sensors.
             raycast_sensors: Ray sensors.
             device: Torch device of all tensors.
+
+        Raises:
+            ValueError: two sensors want one camera to have two projections.
         """
+        check_shared_cameras(camera_sensors)
         self._model, self._data, self._device = model, data, device
-        self._camera_sensors = camera_sensors
+        self._camera_sensors = list(camera_sensors)
+        self._find_render_context: Callable[..., Any] | None = None
         self._raycast_sensors = list(raycast_sensors)
         self.recreate(mj_model)
 
@@ -59,6 +72,9 @@ class SensorContext:
             _RayQuery(groups, sensors, num_envs, self._device)
             for groups, sensors in by_groups.items()
         ]
+        for camera in self._camera_sensors:
+            camera.set_context(self)
+        self._views = tuple(camera.view for camera in self._camera_sensors)
 
     @property
     def has_cameras(self) -> bool:
@@ -70,11 +86,30 @@ class SensorContext:
         """Whether there are ray sensors."""
         return bool(self._raycast_sensors)
 
-    def sense(self, raycast: RayCast) -> None:
-        """Evaluate all sensors at the current poses; `raycast` is the engine's query."""
+    @property
+    def render_context(self) -> Any:
+        """MuJoCo Warp's render context of the first camera sensor.
+
+        Raises:
+            AttributeError: there is no camera, or the engine is another.
+            RuntimeError: nothing has been rendered yet.
+        """
+        if not self._views or self._find_render_context is None:
+            raise AttributeError("There is no render context, because the scene has no camera.")
+        return self._find_render_context(self._views, self._views[0])
+
+    def set_render_context_source(self, find: Callable[..., Any]) -> None:
+        """Set what returns the render context of a view: `Simulation.render_context`."""
+        self._find_render_context = find
+
+    def sense(self, raycast: RayCast, render: Render) -> None:
+        """Evaluate all sensors at the current poses, by the engine's queries."""
         self.prepare()
         for query in self._queries:
             query.cast(raycast)
+        if self._views:
+            for camera, images in zip(self._camera_sensors, render(self._views), strict=True):
+                camera.set_images(images)
         self.finalize()
 
     def prepare(self) -> None:
@@ -83,9 +118,43 @@ class SensorContext:
             sensor.prepare_rays()
 
     def finalize(self) -> None:
-        """Tell the sensors that they have new results."""
+        """Tell the ray sensors that they have new results; cameras take theirs from `sense`."""
         for sensor in self._raycast_sensors:
             sensor.postprocess_rays()
+
+    # Images.
+
+    def unpack_rgb(self) -> None:
+        """Do nothing: colours are unpacked as soon as they are rendered."""
+
+    def get_rgb(self, cam_idx: int) -> torch.Tensor:
+        """Return the latest colours (N, height, width, 3) uint8 of a camera of the model.
+
+        Where several sensors look through it, they are those of the first that asks for colours.
+
+        Raises:
+            ValueError: no camera sensor measures this; the message lists those that do.
+        """
+        return self._image_of(cam_idx, "rgb")
+
+    def get_depth(self, cam_idx: int) -> torch.Tensor:
+        """Return the latest depths (N, height, width, 1) in metres; likewise."""
+        return self._image_of(cam_idx, "depth")
+
+    def get_segmentation(self, cam_idx: int) -> torch.Tensor:
+        """Return the latest ids and types of objects (N, height, width, 2) int32; likewise."""
+        return self._image_of(cam_idx, "segmentation")
+
+    def _image_of(self, cam_idx: int, data_type: str) -> torch.Tensor:
+        offering = [s for s in self._camera_sensors if data_type in s.view.data_types]
+        for sensor in offering:
+            if sensor.camera_idx == cam_idx:
+                return getattr(sensor.data, data_type)
+        known = ", ".join(f"{s.camera_idx} ({s.cfg.name})" for s in offering) or "none"
+        raise ValueError(
+            f"No camera sensor measures {data_type!r} through the camera {cam_idx} of the model. "
+            f"Those that do: {known}. Add it to data_types of the sensor's config."
+        )
 
 
 class _RayQuery:

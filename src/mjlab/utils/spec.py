@@ -17,7 +17,11 @@ from mjlab.utils.spec_actuators import (  # noqa: F401
     create_position_actuator,
     create_velocity_actuator,
 )
-from mjlab.utils.spec_export import export_spec, make_asset_paths_absolute  # noqa: F401
+from mjlab.utils.spec_export import (  # noqa: F401
+    export_spec,
+    make_asset_paths_absolute,
+    put_files_in_memory,
+)
 
 MOCAP_BASE_NAME = "mocap_base"
 

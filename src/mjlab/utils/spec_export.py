@@ -36,7 +36,8 @@ def export_spec(spec: mujoco.MjSpec, output_dir: Path, *, zip: bool = False) -> 
         return
     output_dir.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary) / output_dir.name
+        # Not named after `output_dir`, whose last part may be "..".
+        folder = Path(temporary) / "scene"
         _write_folder(spec, folder)
         shutil.make_archive(str(output_dir), "zip", root_dir=folder)
 
@@ -57,6 +58,24 @@ def make_asset_paths_absolute(spec: mujoco.MjSpec, model_dir: str | None = None)
             path = Path(model_dir, place.folder, place.path).absolute()
             if path.is_file():
                 place.rename(str(path))
+
+
+def put_files_in_memory(spec: mujoco.MjSpec, prefix: str) -> None:
+    """Bring all files that a spec refers to into `spec.assets`, as `<prefix><file>`. Changes `spec`.
+
+    Specs that are merged need that if one of them has files in memory: attaching a spec with such
+    files renames those on disk too, and a path on disk may be taken for a file in memory that ends
+    alike.
+
+    Raises `ValueError` if a file cannot be found.
+    """
+    contents: dict[str, bytes] = {}
+    for place in list(_file_places(spec)):
+        content = _read(spec, place, spec.modelfiledir)
+        name = _unique_name(place, content, contents)
+        contents[name] = content
+        place.rename(prefix + name.replace("/", "_"))
+    spec.assets = {prefix + name.replace("/", "_"): contents[name] for name in contents}
 
 
 class _FilePlace:

@@ -31,6 +31,9 @@ VIEWER_MODEL_FIELDS = frozenset(
         "site_quat",
         "site_size",
         "site_rgba",
+        # What touches in an environment that lacks some geoms; a mesh that is not there must not.
+        "geom_contype",
+        "geom_conaffinity",
         # Frames and inertia of bodies, which the inertia boxes and the centre of mass show.
         "body_pos",
         "body_quat",
@@ -71,6 +74,8 @@ def host_model(model: mujoco.MjModel) -> mujoco.MjModel:
     """A private copy of `model` whose visual settings and randomised fields may be overwritten."""
     private = copy.copy(model)
     disable_model_sameframe_shortcuts(private)
+    # The tree of boxes by which MuJoCo looks for contacts is that of the compiled shapes.
+    private.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
     return private
 
 

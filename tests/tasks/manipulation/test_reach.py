@@ -44,6 +44,16 @@ def test_the_reach_of_a_plain_arm_is_the_length_of_its_links_and_slides():
     assert longest == pytest.approx(0.5 + math.hypot(0.3, 0.4) + 0.3)
 
 
+def test_a_slide_reaches_from_where_the_model_puts_it():
+    model = mujoco.MjModel.from_xml_string("""
+      <mujoco><worldbody><body>
+        <joint type="slide" ref="0.5" range="0 0.6"/><geom size="0.1"/><site name="hand"/>
+      </body></worldbody></mujoco>
+    """)
+    # Back by 0.5 and forward by 0.1.
+    assert reach(model, "hand")[1] == pytest.approx(0.5)
+
+
 @pytest.mark.parametrize(
     "joint", ["<freejoint/>", '<joint type="slide"/>'], ids=["floating", "endless slide"]
 )

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from lifting_stand_ins import Object, StandInEnv, lifting_command, multi_cube_command
-from lifting_tasks import MULTI, lifting, move
+from lifting_tasks import LIFT, MULTI, lifting, move
 
 from mjlab.managers import SceneEntityCfg
 from mjlab.tasks.manipulation import mdp
@@ -115,6 +115,7 @@ def test_joints_cost_what_is_above_their_speed():
             ValueError,
             "object_name is 'cuube'.*Did you mean 'cube'",
         ),
+        ("joint_vel_hinge", {"max_vel": -0.5}, ValueError, "max_vel is -0.5"),
         ("lift", {"command_name": "lift"}, ValueError, "no command 'lift'"),
         ("lift", {"asset_cfg": SceneEntityCfg("robot")}, ValueError, "selects 2 sites.*grasp_site"),
         ("lift", {"asset_cfg": SceneEntityCfg("cube")}, ValueError, "selects 0 sites"),
@@ -130,6 +131,15 @@ def test_a_mistake_in_a_reward_is_one_clear_message_when_it_is_built(
         make_env(edit=edit)
 
 
+@pytest.mark.parametrize("task", [LIFT, MULTI])
+def test_a_reward_that_is_told_no_hand_is_refused_when_it_is_built(make_env, task):
+    def edit(cfg):
+        del cfg.rewards["lift"].params["asset_cfg"]
+
+    with pytest.raises(ValueError, match="term 'lift': asset_cfg selects 2 sites.*grasp_site"):
+        make_env(task, edit=edit, images=False)
+
+
 # The hand on the ground.
 
 
@@ -142,6 +152,15 @@ def test_an_episode_ends_when_the_hand_hits_the_ground_in_any_substep(force, end
     assert mdp.illegal_contact(env, "touch").tolist() == [False, ends, False]
     data.force_history = None
     assert mdp.illegal_contact(env, "touch").tolist() == [True, True, True]
+
+
+@pytest.mark.parametrize("threshold", [-10.0, math.nan])
+def test_a_force_that_no_contact_can_have_is_refused(make_env, threshold):
+    def edit(cfg):
+        cfg.terminations["ee_ground_collision"].params["force_threshold"] = threshold
+
+    with pytest.raises(ValueError, match="'ee_ground_collision': force_threshold is (-10.0|nan)"):
+        make_env(edit=edit)
 
 
 def test_an_arm_that_pushes_its_hand_into_the_ground_ends_its_episode(make_env):

@@ -12,6 +12,7 @@ from tracking_tasks import task_cfg, unperturbed
 from mjlab.asset_zoo.robots import get_go1_robot_cfg
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.tasks.tracking.mdp.motion_drawing import ghost_model
+from mjlab.viewer.viser.viewer import ViserPlayViewer
 
 
 class Board:
@@ -219,15 +220,39 @@ def test_start_here_puts_robots_exactly_there(env, panel):
     panel.page["All envs"].value = False
     panel.page["Start Here"].set_by_person()
     assert panel.asked[-1] == ("start_here", {"type": "gui_reset", "all_envs": False})
-    ids = torch.tensor([0])
-    env.reset(env_ids=ids)
-    assert env.command_manager.apply_gui_reset(ids)
-    assert (command.time_steps[0], command.motion_ids[0]) == (110, 0)
-    away = (command.robot_body_pos_w - command.body_pos_w)[0].abs().max()
-    assert away < 1e-4
+    viewer = SimpleNamespace(
+        env=env, scene=SimpleNamespace(env_idx=0), after_reset=lambda: panel.asked.append("done")
+    )
+    ViserPlayViewer._gui_reset(viewer, all_envs=False)
+    assert panel.asked[-1] == "done"
+    # The robot is there, and the reference a frame ahead, as after every reset.
+    assert (command.time_steps[0], command.motion_ids[0]) == (111, 0)
+    there = command.matching_frame
+    assert (there.robot_body_pos_w - there.body_pos_w)[0].abs().max() < 1e-4
     torch.testing.assert_close(command.body_pos_relative_w, command.relative_poses()[0])
+    # The policy acts on what is seen from there, and not from where the reset put the robot.
+    assert torch.equal(env.get_observations()["actor"][:, :58], command.command)
+    seen = env.observation_manager.compute(update_history=True)
+    torch.testing.assert_close(env.obs_buf["critic"], seen["critic"])
+    drawn(env)
+    lines = panel.page["table"].content.splitlines()
+    assert {line.split("|")[2].strip() for line in lines[2:]} == {"0.0"}
     # It was asked for once.
-    assert not env.command_manager.apply_gui_reset(ids)
+    assert not env.command_manager.apply_gui_reset(torch.tensor([0]))
+
+
+def test_a_start_at_the_last_frame_stays_within_the_motion(env, panel):
+    env.command_manager.on_viewer_pause(True)
+    panel.page["Frame"].set_by_person(220)
+    panel.page["Start Here"].set_by_person()
+    env.command_manager.apply_gui_reset(torch.arange(3))
+    assert command_of(env).time_steps.tolist() == [220, 220, 220]
+
+
+def test_the_panel_goes_on_while_the_ghost_is_switched_off(env, panel):
+    for _ in range(2):
+        env.step(torch.zeros(3, 29))
+    assert panel.page["Frame"].value == 3
 
 
 def test_the_errors_of_the_bodies_are_listed(env, panel):

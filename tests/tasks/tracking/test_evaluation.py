@@ -12,6 +12,7 @@ from tracking_tasks import G1, part_of, task_cfg, unperturbed
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl import RslRlVecEnvWrapper
 from mjlab.rl.evaluate import evaluate_policy
+from mjlab.scripts.cli import UserError
 from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
 from mjlab.tasks.registry import load_rl_cfg
 from mjlab.tasks.tracking.evaluation import TRACKING_ERRORS, play_motions_once
@@ -26,7 +27,7 @@ def short(tmp_path):
     return part_of("wave", slice(0, 25), tmp_path / "short.npz")
 
 
-def evaluated(motion, policy=None, num_envs=4, edit=None, **kwargs):
+def evaluated(motion, policy=None, num_envs=4, edit=None, seed=3, **kwargs):
     cfg = task_cfg(motion, num_envs=num_envs)
     play_motions_once(cfg)
     if edit is not None:
@@ -39,7 +40,7 @@ def evaluated(motion, policy=None, num_envs=4, edit=None, **kwargs):
             policy or (lambda observations: zero),
             metrics=TRACKING_ERRORS,
             success_is_survival=True,
-            seed=3,
+            seed=seed,
             **kwargs,
         )
     finally:
@@ -86,9 +87,10 @@ def test_several_motions_are_played_by_as_many_environments_each(short, tmp_path
 
 
 def test_one_seed_gives_the_same_figures_and_another_one_others(short):
-    one, other = (evaluated(short) for _ in range(2))
-    assert one.returns == other.returns
-    assert one.metrics == other.metrics
+    one, same, other = (evaluated(short, seed=seed) for seed in (3, 3, 4))
+    assert one.returns == same.returns
+    assert one.metrics == same.metrics
+    assert one.metrics["mpkpe"].mean != other.metrics["mpkpe"].mean
 
 
 def test_errors_are_of_matching_times_and_of_no_state_after_a_reset(tmp_path):
@@ -138,5 +140,8 @@ def test_the_script_of_the_interface_writes_its_figures(short, tmp_path, capsys)
     assert list(written)[:6] == keys
     assert len(written["mpkpe_interval"]) == 2
     assert f"mpkpe            {means['mpkpe']:.4f}" in capsys.readouterr().out
+    cfg.num_episodes = 20
+    with pytest.raises(UserError, match="plays one episode; give --num-envs 20"):
+        run_evaluate_tracking(G1, cfg)
     with pytest.raises(ValueError, match="does not track motions"):
         run_evaluate_tracking("Mjlab-Cartpole-Balance", cfg)

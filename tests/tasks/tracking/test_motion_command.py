@@ -10,6 +10,7 @@ from tracking_tasks import G1, G1_BLIND, part_of, task_cfg, unperturbed
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.tasks.tracking.mdp import perturbed_start as start_module
+from mjlab.tasks.tracking.mdp.motion_command import MotionCommandCfg
 from mjlab.tasks.tracking.mdp.motion_reader import MotionFrame
 from mjlab.utils.lab_api.math import quat_from_euler_xyz, quat_mul
 
@@ -59,7 +60,10 @@ def test_after_a_reset_the_robot_is_at_a_frame_and_the_reference_at_the_next(mak
     assert not robot_is_at(env, command.frame_indexes)
     # The frame that matches the robot, for evaluations.
     assert torch.equal(command.matching_frame.frame_indexes, command.frame_indexes - 1)
-    for name in ("error_anchor_pos", "error_anchor_rot", "error_joint_pos", "error_body_lin_vel"):
+    for name in (
+        "error_anchor_pos", "error_anchor_rot", "error_joint_pos", "error_body_lin_vel",
+        "error_body_pos", "error_body_rot",
+    ):  # fmt: skip
         assert command.metrics[name].max() < 2e-3, name
 
 
@@ -324,6 +328,24 @@ def test_relative_poses_are_those_of_now_after_a_reset(make_env):
         idle(env)
 
 
+def test_errors_after_a_reset_in_a_step_are_not_of_the_pose_before_it(make_env):
+    env = make_env(edit=unperturbed, sampling_mode="start", motion="slow_walk", num_envs=2)
+    env.reset()
+    command = command_of(env)
+    for _ in range(3):
+        idle(env)
+    kept = command.metrics["error_body_pos"][1].clone()
+    # Half way through the walk, which is a step from where it starts.
+    command.reset_to_frame(torch.tensor([0]), 200)
+    env.sim.forward()
+    command.update_relative_body_poses()
+    displaced(env, [0.0, 0.0, 1.0], 0.0)
+    assert idle(env)[2].all()
+    assert command.metrics["error_body_pos"].max() < 2e-3
+    assert command.metrics["error_body_rot"].max() < 5e-3
+    assert kept > 0.0
+
+
 # Failures.
 
 
@@ -385,6 +407,25 @@ def test_episodes_start_where_they_fail(make_env):
     assert command.metrics["sampling_top1_bin"].tolist() == pytest.approx([0.6] * 64)
 
 
+# Going on where a run was.
+
+
+@pytest.mark.parametrize("lengths", [(221, 205), (40, 205, 221)])
+def test_the_state_of_a_run_on_motions_of_other_lengths_is_refused(make_env, tmp_path, lengths):
+    """Its frames may not exist here. Both have as many segments in all, or have no statistics."""
+
+    def env_of(*counts):
+        files = [part_of("wave", slice(0, n), tmp_path / f"{n}.npz") for n in counts]
+        return make_env(motion=",".join(map(str, files)), sampling_mode="uniform", num_envs=2)
+
+    one, other = env_of(*lengths), env_of(*lengths[::-1])
+    one.reset()
+    other.reset()
+    with pytest.raises(ValueError, match="not the one that was saved: .*_extent"):
+        other.load_state_dict(one.state_dict())
+    one.load_state_dict(one.state_dict())
+
+
 # What is refused.
 
 
@@ -405,6 +446,7 @@ def test_episodes_start_where_they_fail(make_env):
         ({"adaptive_kernel_size": 0}, "adaptive_kernel_size is 0"),
         ({"adaptive_uniform_ratio": 0.0}, "adaptive_uniform_ratio is 0.0"),
         ({"adaptive_alpha": 1.5}, "adaptive_alpha is 1.5"),
+        ({"viz": MotionCommandCfg.VizCfg(mode="axes")}, "viz.mode is 'axes'; it is one of"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_when_the_task_is_built(changes, message):

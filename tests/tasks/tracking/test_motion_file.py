@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from tracking_tasks import part_of
 
+from mjlab.tasks.tracking.mdp.motion_loader import MotionLoader
 from mjlab.tasks.tracking.motion_file import (
     MotionFileError,
     check_motion_fits,
@@ -93,6 +95,7 @@ def with_long_quaternion() -> np.ndarray:
         ({key: getattr(SQUAT, key)[:0] for key in ARRAYS}, "0 frames; it needs at least 2"),
         ({key: getattr(SQUAT, key)[:1] for key in ARRAYS}, "1 frames; it needs at least 2"),
         ({"fps": np.array([0.0])}, "fps of the motion .* has to be one rate above 0"),
+        ({"fps": np.array([np.inf])}, "fps of the motion .* has to be one rate above 0"),
         ({"fps": np.array([50, 60])}, "fps of the motion .* has to be one rate above 0"),
         ({"joint_pos": np.full((10, 29), "a")}, "holds <U1, and no numbers"),
         ({"joint_names": np.array(["a", "b"])}, "2 joint_names, and 29 columns in joint_pos"),
@@ -159,6 +162,30 @@ def test_motions_are_found_by_name_by_file_and_by_folder(tmp_path):
 def test_a_path_with_a_comma_is_one_path(tmp_path):
     path = part_of("wave", slice(0, 5), tmp_path / "a, b.npz")
     assert find_motions(str(path)) == [path]
+    other = part_of("wave", slice(0, 5), tmp_path / "c,d, e.npz")
+    assert find_motions(f"squat,{path} , {other},wave") == [
+        shipped_motions()["squat"], path, other, shipped_motions()["wave"],
+    ]  # fmt: skip
+    with pytest.raises(MotionFileError, match="no motion file 'b.npz'"):
+        find_motions(f"squat,b.npz,{other}")
+
+
+def test_a_list_may_be_longer_than_a_path(tmp_path):
+    names = [tmp_path / f"{'x' * 100}{i}.npz" for i in range(60)]
+    part_of("wave", slice(0, 5), names[0])
+    for name in names[1:]:
+        name.write_bytes(names[0].read_bytes())
+    assert find_motions(",".join(map(str, names))) == names
+    with pytest.raises(MotionFileError, match="There is no motion file 'yyy"):
+        find_motions("y" * 5000)
+
+
+def test_bodies_that_a_file_lacks_are_told():
+    path = shipped_motions()["wave"]
+    assert MotionLoader(path, torch.tensor([0, 29])).body_pos_w.shape == (261, 2, 3)
+    for wrong in (30, -1):
+        with pytest.raises(MotionFileError, match=rf"has 30 bodies, and .* indexes \[{wrong}\]"):
+            MotionLoader(path, torch.tensor([0, wrong]))
 
 
 @pytest.mark.parametrize(

@@ -112,6 +112,13 @@ def test_a_policy_is_played_on_the_motions_that_its_run_recorded(tmp_path):
     assert found[0].parent == tmp_path / "run" / "motion"
 
 
+def test_recorded_motions_in_a_folder_with_a_comma_are_found(tmp_path):
+    run = tmp_path / "run, the second"
+    record_motions([WALK, SQUAT], run)
+    found = prepared(MotionOptions(), PolicyOrigin(G1, run / "model_9.pt"))
+    assert [path.name for path in found] == ["slow_walk.npz", "squat.npz"]
+
+
 def test_a_run_that_recorded_none_is_told(tmp_path, caplog):
     prepared(MotionOptions(), PolicyOrigin(G1, tmp_path / "model_9.pt"))
     assert "recorded no motion; squat,wave is taken" in caplog.text
@@ -125,6 +132,28 @@ def test_an_artifact_of_the_registry_is_fetched_in_its_latest_version(wandb, tmp
     (found,) = prepared(MotionOptions(registry_name="org/dances/squat:v1"))
     assert found.read_bytes() == WALK.read_bytes()
     assert MotionOptions(registry_name="x").runner_kwargs() == {"registry_name": "x"}
+
+
+def test_an_artifact_of_another_tool_has_its_motion_beside_other_files(wandb, tmp_path):
+    artifact = wandb.artifacts["org/a:latest"] = Artifact(tmp_path / "a", SQUAT)
+    shutil.copyfile(WALK, tmp_path / "a" / "contacts.npz")
+    (found,) = prepared(MotionOptions(registry_name="org/a"))
+    assert found.read_bytes() == SQUAT.read_bytes()
+    (tmp_path / "a" / "motion.npz").rename(tmp_path / "a" / "dance.npz")
+    names = [path.name for path in prepared(MotionOptions(registry_name="org/a"))]
+    assert names == ["contacts.npz", "dance.npz"]
+    assert artifact.type == "motions"
+
+
+def test_not_being_logged_in_is_told(wandb, monkeypatch):
+    def api():
+        raise RuntimeError("No API key configured")
+
+    monkeypatch.setattr(sys.modules["wandb"], "Api", api)
+    with pytest.raises(MotionFileError, match="Cannot fetch .*No API key"):
+        prepared(MotionOptions(registry_name="org/a"))
+    with pytest.raises(MotionFileError, match="Cannot read .*No API key"):
+        prepared(MotionOptions(), PolicyOrigin(G1, Path("m.pt"), "org/p/1"))
 
 
 def test_a_policy_of_wandb_comes_with_the_motion_that_its_run_used(wandb, tmp_path):

@@ -12,14 +12,17 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from tracking_tasks import G1, G1_BLIND, task_cfg
+from tracking_tasks import G1, G1_BLIND, part_of, task_cfg
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl import RslRlVecEnvWrapper
+from mjlab.rl.onnx_policy import OnnxPolicyError, load_onnx_policy
+from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
 from mjlab.tasks.registry import load_rl_cfg, load_runner_cls
 from mjlab.tasks.tracking.motion_file import MotionFileError
 from mjlab.tasks.tracking.motion_record import record_motions, recorded_motions
 from mjlab.tasks.tracking.motion_sources import shipped_motions
+from mjlab.tasks.tracking.options import MotionOptions
 from mjlab.tasks.tracking.rl import MotionTrackingOnPolicyRunner
 from mjlab.utils.random import seed_rng
 
@@ -98,6 +101,26 @@ def test_the_exported_policy_says_what_its_reference_is_of(make_runner, tmp_path
     assert metadata["command_names"] == "motion"
     assert metadata["observation_names"].startswith("command,motion_anchor_pos_b")
     assert len(metadata["joint_names"].split(",")) == 29
+
+
+def test_the_exported_policy_is_played_and_scored_as_its_checkpoint_is(make_runner, tmp_path):
+    runner = make_runner()
+    folder = tmp_path / "run"
+    runner.save(str(folder / "model_0.pt"))
+    policy = load_onnx_policy(folder / "run.onnx", runner.env, "cpu")
+    observations = runner.env.get_observations()
+    with torch.inference_mode():
+        expected = runner.get_inference_policy()(observations)
+    torch.testing.assert_close(policy(observations), expected, atol=1e-5, rtol=1e-4)
+    part_of("wave", slice(0, 25), folder / "motion" / "short.npz")
+    cfg = EvaluateConfig(checkpoint_file=str(folder / "run.onnx"), num_episodes=3, device="cpu")
+    cfg.options = MotionOptions(motion_file=str(folder / "motion" / "short.npz"))
+    figures = run_evaluate(G1, cfg)
+    assert figures["mean_length"] == 24
+    assert figures["policy"].endswith("run.onnx")
+    # A robot that is another one to the policy: without state estimation.
+    with pytest.raises(OnnxPolicyError, match="trained for another environment.*observation_names"):
+        run_evaluate(G1_BLIND, cfg)
 
 
 def test_the_motions_are_kept_in_the_folder_of_the_run(make_runner, tmp_path):

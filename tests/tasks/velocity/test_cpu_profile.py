@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import asdict
+from types import SimpleNamespace
 
 import pytest
 
@@ -28,6 +30,23 @@ def test_evaluations_undo_what_the_profile_eases(task, play, tmp_path):
     dump_yaml(tmp_path / "undone.yaml", asdict(env_cfg))
     dump_yaml(tmp_path / "task.yaml", asdict(load_env_cfg(task, play=play)))
     assert (tmp_path / "undone.yaml").read_text() == (tmp_path / "task.yaml").read_text()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_evaluations_push_as_hard_as_the_task_however_far_training_is(task):
+    env_cfg, rl_cfg = load_env_cfg(task), load_rl_cfg(task)
+    cpu(env_cfg, rl_cfg)
+    env = SimpleNamespace(
+        common_step_counter=10,
+        event_manager=SimpleNamespace(get_term_cfg=lambda name: env_cfg.events[name]),
+    )
+    # Training edits the config that evaluations copy.
+    growing = env_cfg.curriculum["eased_push_robot"]
+    assert 0.0 < growing.func(env, slice(None), **growing.params) < 0.01
+    copied = copy.deepcopy(env_cfg)
+    rl_cfg.evaluation.prepare_env(copied)
+    pushes = load_env_cfg(task).events["push_robot"].params
+    assert copied.events["push_robot"].params == pushes
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from mjlab.envs.mdp._checks import check_contact_sensor
+from mjlab.managers.build_checks import checked_when_built
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.utils.nan_guard import NanGuard
 
@@ -40,6 +42,22 @@ def root_height_below_minimum(
     """The root is lower than `minimum_height` (m), in world coordinates."""
     asset: Entity = env.scene[asset_cfg.name]
     return asset.data.root_link_pos_w[:, 2] < minimum_height
+
+
+@checked_when_built(check_contact_sensor)
+def illegal_contact(
+    env: ManagerBasedRlEnv, sensor_name: str, force_threshold: float = 10.0
+) -> torch.Tensor:
+    """Something touches what it should not.
+
+    With a history of forces: any force above `force_threshold` (N) in any of those last substeps.
+    Without one: any contact.
+    """
+    data = env.scene[sensor_name].data
+    if data.force_history is None:
+        return (data.found > 0).any(dim=1)
+    hits = data.force_history.square().sum(dim=-1) > force_threshold**2
+    return hits.flatten(start_dim=1).any(dim=1)
 
 
 def nan_detection(env: ManagerBasedRlEnv) -> torch.Tensor:

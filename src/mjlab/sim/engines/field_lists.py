@@ -16,6 +16,9 @@ ZERO_INPUTS = (
 # All that somebody writes before a step, or that a step itself carries on.
 INPUTS = (*ZERO_INPUTS, "qpos", "eq_active", "mocap_pos", "mocap_quat")
 
+# Which geoms may touch each other.
+COLLISION_MASKS = ("geom_contype", "geom_conaffinity")
+
 # What mj_setConst writes: sums over the tree, and what depends on the configuration qpos0.
 FIXED_CONSTANTS = ("body_subtreemass",)
 CONSTANTS_AT_QPOS0 = (

@@ -6,6 +6,8 @@ and its base are not there.
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 
@@ -54,7 +56,7 @@ class CullingRule:
         distances: Array,
         normals: Array,
         geoms: Array,
-        poses: tuple[Array, Array] | None = None,
+        poses: tuple[Any, Any] | None = None,
     ) -> Array:
         """Return which hits (n, R) do not count; vectors are (n, R, 3), geoms -1 for a miss.
 
@@ -85,7 +87,7 @@ class CullingRule:
             passed[index] = self._begins_below(*at, poses)
         return passed
 
-    def _poses_of(self, geoms: Array, poses: tuple[Array, Array] | None) -> tuple[Array, Array]:
+    def _poses_of(self, geoms: Array, poses: tuple[Any, Any] | None) -> tuple[Array, Array]:
         """Return positions (..., 3) and orientations (..., 3, 3) of geoms (...,)."""
         if poses is None:
             return self._pos[geoms], self._mat[geoms]
@@ -98,7 +100,7 @@ class CullingRule:
         directions: Array,
         distances: Array,
         geoms: Array,
-        poses: tuple[Array, Array] | None,
+        poses: tuple[Any, Any] | None,
     ) -> Array:
         """Return for hits (M,) at the height of the base whether the surface is above them."""
         pos, mat = self._poses_of(geoms, poses)

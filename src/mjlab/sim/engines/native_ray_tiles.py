@@ -51,11 +51,16 @@ class StaticGeoms:
     """(G, 2) upper corner."""
 
 
+def in_groups(model: mujoco.MjModel, groups: tuple[int, ...] | None) -> Array:
+    """Return which geoms are of these groups (None: any), (ngeom,) bool."""
+    if groups is None:
+        return np.ones(model.ngeom, dtype=bool)
+    return np.isin(model.geom_group.clip(0, 5), groups)
+
+
 def visible_geoms(model: mujoco.MjModel, groups: tuple[int, ...] | None) -> Array:
     """Return which geoms rays of these groups can meet at all, (ngeom,) bool."""
-    visible = np.ones(model.ngeom, dtype=bool)
-    if groups is not None:
-        visible &= np.isin(model.geom_group.clip(0, 5), groups)
+    visible = in_groups(model, groups)
     alpha = model.geom_rgba[:, 3].copy()
     has_material = model.geom_matid >= 0
     alpha[has_material] = model.mat_rgba[model.geom_matid[has_material], 3]

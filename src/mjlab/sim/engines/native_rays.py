@@ -7,7 +7,8 @@ the few geoms that are near (`native_ray_nearby`). Their numbers are the same, h
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+import logging
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -19,14 +20,18 @@ from mjlab.sim.engines.native_ray_casting import Hits, cast_through
 from mjlab.sim.engines.native_ray_culling import CullingRule
 from mjlab.sim.engines.native_ray_nearby import NearbyRays, cluster_rays
 from mjlab.sim.engines.native_ray_planes import StaticPlanes
+from mjlab.sim.engines.native_ray_sharing import SharedGeoms
 from mjlab.sim.engines.native_ray_tiles import (
     StaticGeoms,
+    in_groups,
     is_static,
     is_welded,
     movable_kind,
     static_geoms,
     visible_geoms,
 )
+
+logger = logging.getLogger(__name__)
 
 Array = np.ndarray
 MakeBatch = Callable[[mujoco.MjModel, int], Any]
@@ -43,13 +48,8 @@ _PAUSE = 100
 # If more of the environments than this have rays that left their window, windows are made larger.
 _MAX_STRAYS = 0.02
 
-# Where one of these differs between environments, so may the geoms that never move.
-_STATIC_FIELDS = frozenset(
-    {
-        "geom_pos", "geom_quat", "geom_size", "geom_dataid", "geom_group", "geom_rgba",
-        "geom_matid", "mat_rgba", "body_pos", "body_quat",
-    }
-)  # fmt: skip
+# Where one of these differs between environments, geoms may become visible.
+_LOOKS = frozenset({"geom_rgba", "geom_matid", "mat_rgba"})
 
 
 class NativeRays:
@@ -69,6 +69,7 @@ class NativeRays:
         mujoco.mj_kinematics(model, self._host)
         self._rule = CullingRule(model, self._host.geom_xpos, self._host.geom_xmat)
         self._plans: dict[Any, _Plan] = {}
+        self._has_warned = False
 
     def cast(
         self,
@@ -77,24 +78,25 @@ class NativeRays:
         geom_groups: tuple[int, ...] | None,
         exclude_body_ids: torch.Tensor | None,
         max_distances: torch.Tensor | None,
-        expanded: Collection[str],
+        fields: Mapping[str, torch.Tensor],
     ) -> Hits:
         """Cast rays (N, R); see `Engine.raycast`.
 
-        `expanded` are the names of the model fields that differ between environments.
+        `fields` are the model fields that environments have for themselves, (N, ...).
         """
         excluded = None
         if exclude_body_ids is not None:
             excluded = np.ascontiguousarray(exclude_body_ids.numpy().astype(np.int32))
         rays = origins.shape[1]
-        key = (geom_groups, rays, None if excluded is None else excluded.tobytes())
+        looks_vary = not _LOOKS.isdisjoint(fields)
+        key = (geom_groups, rays, None if excluded is None else excluded.tobytes(), looks_vary)
         if key not in self._plans:
-            self._plans[key] = self._plan(geom_groups, excluded)
+            self._plans[key] = self._plan(geom_groups, excluded, looks_vary)
         plan = self._plans[key]
         hits = Hits.empty(len(origins), rays)
         trials = origins.shape[0] * rays * self._model.ngeom
         is_first, plan.is_new = plan.is_new and trials < _MIN_TRIALS, False
-        is_shared = _STATIC_FIELDS.isdisjoint(expanded)
+        is_shared = self._is_shared(plan, fields)
         if plan.planes is not None and is_shared:
             plan.planes.cast(origins.numpy(), directions.numpy(), hits)
         elif is_first or plan.nearby is None or not is_shared:
@@ -111,12 +113,34 @@ class NativeRays:
     def _movable(self) -> Array:
         return movable_kind(self._model)
 
-    def _plan(self, groups: tuple[int, ...] | None, excluded: Array | None) -> _Plan:
+    def _is_shared(self, plan: _Plan, fields: Mapping[str, torch.Tensor]) -> bool:
+        """Return whether the geoms that are not looked for in the model are as compiled."""
+        if plan.shared is None:
+            return True
+        field = plan.shared.differing_field(fields)
+        if field is not None and not self._has_warned:
+            self._has_warned = True
+            logger.warning(
+                "Rays try every geom of the model from now on, which is much slower: the field %r "
+                "of geoms that never move, such as the ground, differs between environments or "
+                "from the compiled model. Randomize it for things that move only (asset_cfg).",
+                field,
+            )
+        return field is None
+
+    def _plan(
+        self, groups: tuple[int, ...] | None, excluded: Array | None, looks_vary: bool
+    ) -> _Plan:
         """Find out which geoms the rays can meet, and which of these are looked up by place."""
         model = self._model
         visible = visible_geoms(model, groups)
+        if looks_vary:
+            # What moves may have been compiled transparent, and be seen in some environment.
+            visible |= in_groups(model, groups) & ~is_static(model)
         plan = _Plan(groups, excluded, is_one_sided=self._rule.concerns(visible))
         plan.planes = StaticPlanes.alone(model, self._host, visible, excluded)
+        if plan.planes is not None:
+            plan.shared = SharedGeoms(model, np.flatnonzero(visible))
         near = visible & is_static(model)
         if near.sum() < _MIN_GEOMS:
             return plan
@@ -128,6 +152,7 @@ class NativeRays:
         kept = excluded is None or not np.isin(model.geom_bodyid[near], excluded).any()
         if complete and kept and near.sum() >= _MIN_GEOMS:
             plan.nearby = static_geoms(model, self._host, near)
+            plan.shared = SharedGeoms(model, np.flatnonzero(near))
         return plan
 
     def _cast_all(
@@ -249,6 +274,7 @@ class _Plan:
         self.is_new = True
         self.planes: StaticPlanes | None = None
         self.nearby: StaticGeoms | None = None
+        self.shared: SharedGeoms | None = None
         self.has_moving = False
         self.pause = 0
         self.parts: list[NearbyRays] = []

@@ -28,6 +28,7 @@ from mjlab.sim.engine import (
     EngineUnavailableError,
 )
 from mjlab.sim.engines.field_lists import (
+    COLLISION_MASKS,
     CONSTANTS_AT_QPOS0,
     FIXED_CONSTANTS,
     INPUTS,
@@ -37,6 +38,7 @@ from mjlab.sim.engines.sensor_fed import refuse_without_sensor
 from mjlab.sim.engines.warp_fields import find_data_field, find_model_field
 from mjlab.sim.engines.warp_overflow import OverflowWatch, contacts_per_environment
 from mjlab.sim.engines.warp_rays import WarpRays
+from mjlab.sim.engines.warp_render import WarpRenderer
 from mjlab.sim.engines.warp_support import (
     UnsupportedByWarpError,
     mocap_bodies,
@@ -48,6 +50,8 @@ from mjlab.sim.engines.warp_support import (
 
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
+    from mjlab.sim.rendering import CameraView, Images
+    from mjlab.sim.variants import VariantValues
 
 logger = logging.getLogger(__name__)
 
@@ -68,6 +72,8 @@ _RESULTS_ZERO_ON_RESET = (
     "nl",
     "nefc",
 )
+# Metres from everything else.
+_NOWHERE = 1e6
 # A geom that is welded to the world moves only if one of these is changed.
 _STATIC_POSE = frozenset({"body_pos", "body_quat", "geom_pos", "geom_quat"})
 
@@ -116,6 +122,7 @@ class WarpEngine(Engine):
         self._model_tensors: dict[str, torch.Tensor] = {}
         self._graphs: dict[str, Any] = {}
         self._rays: WarpRays | None = None
+        self._renderer: WarpRenderer | None = None
         self._eq_active0 = torch.as_tensor(model.eq_active0.astype(bool), device=self.device)
         self._mocap_bodies = torch.as_tensor(
             mocap_bodies(model), dtype=torch.int64, device=self.device
@@ -270,6 +277,14 @@ class WarpEngine(Engine):
         # A graph keeps the addresses of the arrays it was captured with.
         if new and self.num_envs > 1:
             self._graphs.clear()
+
+    def hide_geoms(self, absent: torch.Tensor) -> None:
+        self.expand(("geom_rbound", "geom_aabb"))
+        hide_geoms(self.wp_model, absent)
+        # For those who read them: Warp itself has one for all environments.
+        for name in COLLISION_MASKS:
+            mask = torch.as_tensor(getattr(self._host.model, name), device=self.device)
+            self._model_tensors[name] = mask.expand(absent.shape).masked_fill(absent, 0)
 
     def constants_written_by(self, level: int) -> tuple[str, ...]:
         names: tuple[str, ...] = ()
@@ -436,6 +451,19 @@ class WarpEngine(Engine):
             geom_ids.masked_fill_(missed, -1)
         return distances, normals, geom_ids
 
+    def render(self, views: tuple[CameraView, ...]) -> list[Images]:
+        if self._renderer is None:
+            self._renderer = WarpRenderer(
+                self._host.model, self.wp_model, self.wp_data, self._ordered, self._launch
+            )
+        return self._renderer.render(views, self._model_tensors.keys())
+
+    def render_context(self, views: tuple[CameraView, ...], view: CameraView) -> Any:
+        """Return the `mujoco_warp.RenderContext` of a view, one of `views` rendered together."""
+        if self._renderer is None:
+            raise RuntimeError("Nothing has been rendered yet; call Simulation.sense() first.")
+        return self._renderer.context_of(views, view)
+
     def jacobian(
         self, points: torch.Tensor, body_ids: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -533,6 +561,45 @@ def _torch_on_warps_stream(device: Any) -> Generator[None]:
         return
     with torch.cuda.stream(wp.stream_to_torch(device)):
         yield
+
+
+def put_variant_model(model: mujoco.MjModel, nworld: int, values: VariantValues) -> Any:
+    """Return a `mujoco_warp.Model` on the current device, with each world's own values."""
+    wp_model = mjwarp.put_model(model)
+    device = wp_model.geom_pos.device
+    fields = [name for name in values.fields if name not in COLLISION_MASKS]
+    expand_arrays(wp_model, nworld, fields)
+    with _torch_on_warps_stream(device):
+        for name in fields:
+            own = as_torch(getattr(wp_model, name))
+            own.copy_(torch.as_tensor(values.get(name)).view(own.shape))
+        if values.absent_geoms.any():
+            absent = torch.as_tensor(values.absent_geoms, device=wp.device_to_torch(device))
+            hide_geoms(wp_model, absent)
+    return wp_model
+
+
+def hide_geoms(model: Any, absent: torch.Tensor) -> None:
+    """Keep geoms (N, ngeom) out of all contacts: put their bounds where nothing else is.
+
+    Which geoms may touch is compiled for all environments alike, but the search for geoms that are
+    near goes by bounds, and these differ. A hugely negative radius is above every plane, and a box
+    out there, in another place for each geom, meets no other box.
+
+    Raises:
+        ValueError: the search does not compare bounds with planes, or not boxes with boxes.
+    """
+    filters, known = int(model.opt.broadphase_filter), mjwarp.BroadphaseFilter
+    if not (filters & known.PLANE and filters & (known.AABB | known.OBB)):
+        raise ValueError(
+            "SimulationCfg.broadphase_filter must hold 'plane', and 'aabb' or 'obb', where "
+            "variants of an entity have different numbers or types of geoms. Add them, leave "
+            "the option at None, or use --engine native."
+        )
+    as_torch(model.geom_rbound).masked_fill_(absent, -_NOWHERE / 10)
+    centres = as_torch(model.geom_aabb)[:, :, 0]
+    places = _NOWHERE * torch.arange(1, absent.shape[1] + 1, device=absent.device)
+    centres.copy_(torch.where(absent[..., None], places[:, None], centres))
 
 
 def set_broadphase(wp_opt: Any, kind: str | None, filters: tuple[str, ...] | None) -> None:

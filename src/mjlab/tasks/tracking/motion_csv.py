@@ -40,6 +40,7 @@ def read_csv(
     """
     path = Path(path)
     table = _chosen_lines(path, _table(path), line_range)
+    first = 1 if line_range is None else line_range[0]
     expected = _ROOT_COLUMNS + len(joint_names)
     if table.shape[1] != expected:
         raise MotionFileError(
@@ -47,14 +48,14 @@ def read_csv(
             f"of orientation (x y z w), and {len(joint_names)} of joints: {list(joint_names)}."
         )
     if not np.isfinite(table).all():
-        line = int(np.argwhere(~np.isfinite(table))[0][0]) + 1
+        line = int(np.argwhere(~np.isfinite(table))[0][0]) + first
         raise MotionFileError(f"Line {line} of {path} has a number that is NaN or infinite.")
     quat = table[:, [6, 3, 4, 5]]
     norms = np.linalg.norm(quat, axis=1, keepdims=True)
     wrong = np.flatnonzero(np.abs(norms[:, 0] - 1.0) > _QUAT_TOLERANCE)
     if len(wrong) > 0:
         raise MotionFileError(
-            f"Columns 4 to 7 of {path} have to be unit quaternions (x y z w); in line {wrong[0] + 1} "
+            f"Columns 4 to 7 of {path} have to be unit quaternions (x y z w); in line {wrong[0] + first} "
             f"the norm is {norms[wrong[0], 0]:.4g}."
         )
     return Recording(

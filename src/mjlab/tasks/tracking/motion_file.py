@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import math
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -104,6 +105,12 @@ def read_motion(path: str | Path) -> Motion:
     return Motion(fps=_fps(path, content.get("fps")), **values, **names)
 
 
+def npz_path(path: str | Path) -> Path:
+    """Return where a motion of that name goes: `.npz` is added where it is missing."""
+    path = Path(path)
+    return path if path.suffix == ".npz" else path.with_name(f"{path.name}.npz")
+
+
 def write_motion(path: str | Path, motion: Motion) -> Path:
     """Write a motion, compressed, and return its path; folders are made, `.npz` is added.
 
@@ -114,9 +121,7 @@ def write_motion(path: str | Path, motion: Motion) -> Path:
     """
     if motion.fps is None:
         raise MotionFileError(f"The motion to write to {path} has no fps.")
-    path = Path(path)
-    if path.suffix != ".npz":
-        path = path.with_name(path.name + ".npz")
+    path = npz_path(path)
     entries = {"fps": np.array([motion.fps], dtype=np.float32)}
     entries |= {key: np.asarray(getattr(motion, key), dtype=np.float32) for key in _ARRAYS}
     entries |= {
@@ -265,11 +270,15 @@ def _names(path: Path, key: str, value: np.ndarray | None) -> tuple[str, ...]:
     return tuple(str(name) for name in value)
 
 
+def _is_rate(array: np.ndarray) -> bool:
+    return 0.0 < float(array.reshape(())) < math.inf
+
+
 def _fps(path: Path, value: Any) -> float | None:
     if value is None:
         return None
     array = np.asarray(value)
-    if array.size != 1 or array.dtype.kind not in "fiu" or not float(array.reshape(())) > 0.0:
+    if array.size != 1 or array.dtype.kind not in "fiu" or not _is_rate(array):
         raise MotionFileError(
             f"fps of the motion {path} is {value!r}; it has to be one rate above 0."
         )

@@ -33,10 +33,18 @@ def resampled(recording: Recording, fps: float) -> Recording:
 
     Times are 0, 1/fps, 2/fps, ... up to, and without, the last pose: 301 poses at 30 per second are
     500 at 50 per second.
+
+    Raises:
+        ValueError: fewer than two are left.
     """
     intervals = len(recording) - 1
     # The small number keeps a duration of 10.000000001 s at 10 s.
     count = math.ceil(intervals * fps / recording.fps - 1e-6)
+    if count < 2:
+        raise ValueError(
+            f"{len(recording)} poses at {recording.fps:g} per second make {max(count, 0)} at {fps:g} "
+            "per second; at least 2 are needed."
+        )
     phase = np.arange(count) * (recording.fps / fps)
     # Where a time is that of a pose, the pose is taken as it is.
     phase = np.where(

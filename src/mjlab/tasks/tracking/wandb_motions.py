@@ -10,6 +10,7 @@ from mjlab.tasks.tracking.motion_file import MotionFileError
 from mjlab.tasks.tracking.motion_record import FOLDER, INDEX, recorded_motions
 
 _ARTIFACT_TYPE = "motions"
+_ARTIFACT_FILE = "motion.npz"
 _DEFAULT_ALIAS = "latest"
 
 
@@ -25,9 +26,8 @@ def fetch_artifact(registry_name: str) -> list[Path]:
         MotionFileError: it cannot be fetched, or has no motion in it.
     """
     name = full_artifact_name(registry_name)
-    api = _api()
     try:
-        artifact = api.artifact(name)
+        artifact = _api().artifact(name)
         return _motions_in(artifact, name)
     except MotionFileError:
         raise
@@ -49,9 +49,8 @@ def fetch_motions_of_run(run_path: str) -> list[Path]:
     Raises:
         MotionFileError: the run cannot be read, or has neither.
     """
-    api = _api()
     try:
-        run = api.run(run_path)
+        run = _api().run(run_path)
         files = [file for file in run.files() if file.name.startswith(f"{FOLDER}/")]
         if any(file.name == f"{FOLDER}/{INDEX}" for file in files):
             folder = Path(tempfile.gettempdir()) / "mjlab-motions" / Path(run_path).name
@@ -77,6 +76,8 @@ def fetch_motions_of_run(run_path: str) -> list[Path]:
 def _motions_in(artifact: Any, name: str) -> list[Path]:
     """Return the motions in an artifact; `motion.npz`, as mjlab 1.6 calls it, or all there are."""
     folder = Path(artifact.download())
+    if (folder / _ARTIFACT_FILE).is_file():
+        return [folder / _ARTIFACT_FILE]
     files = sorted(folder.glob("*.npz"))
     if not files:
         raise MotionFileError(f"The artifact {name!r} has no motion (.npz) in it.")

@@ -101,9 +101,11 @@ class CircularBuffer:
         """Push a frame of shape (batch_size, ...). Raises `ValueError` for another shape."""
         if self._buffer is None:
             self._check_batch(data)
-            self._buffer = torch.zeros(
-                (self._max_len, *data.shape), dtype=data.dtype, device=self._device
-            )
+            # A first frame under `inference_mode` must not forbid later ones without it.
+            with torch.inference_mode(False):
+                self._buffer = torch.zeros(
+                    (self._max_len, *data.shape), dtype=data.dtype, device=self._device
+                )
         elif data.shape != self._buffer.shape[1:]:
             raise ValueError(
                 f"Got a frame of shape {tuple(data.shape)}; the first one had "

@@ -60,7 +60,11 @@ class NoiseModelWithAdditiveBias(NoiseModel):
         """Return `data`, (num_envs, ..., components), with noise and bias."""
         if self._waits_for_components:
             self._waits_for_components = False
-            self._bias = self._bias.new_zeros(self._num_envs, data.shape[-1])
+            # Data that comes first under `inference_mode` must not forbid later resets without it.
+            with torch.inference_mode(False):
+                self._bias = torch.zeros(
+                    self._num_envs, data.shape[-1], dtype=self._bias.dtype, device=self._device
+                )
             self.reset()
         bias = self._bias
         if data.dim() > 2:

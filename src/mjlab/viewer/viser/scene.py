@@ -62,6 +62,8 @@ class MjlabViserScene(ViserMujocoScene):
         self.debug = ViserDebugVisualizer(server, mj_model)
         self.debug_enabled = True
         self.show_all_debug = False
+        self.offset = np.zeros(3)
+        """How far the scene was moved when it was drawn last, (3,)."""
         self._variants = GeomVariants(self)
         self._redraw = threading.Event()
         self.set_refresh_handler(self._redraw.set)
@@ -91,7 +93,7 @@ class MjlabViserScene(ViserMujocoScene):
             if not name.startswith("mocap") or self.mj_model.nmocap > 0
         }
         xmat = arrays["xmat"].reshape(*arrays["xpos"].shape[:2], 3, 3)
-        offset = self._offset(arrays["xpos"][env_idx])
+        self.offset = offset = self._offset(arrays["xpos"][env_idx])
         mj_data = self._forward_selected(sim, env_idx)
         with self._update_lock, self.server.atomic():
             self._variants.update(sim, arrays["xpos"], xmat, offset)

@@ -97,7 +97,9 @@ class GeomVariants:
             geoms = np.isin(model.geom_bodyid, batch.body_ids)
             if (varying & geoms & (model.geom_group == batch.group_id)).any():
                 batch.handle.remove()
-                self._scene._mesh_groups.remove(batch)
+                # Batches hold arrays, so that they cannot be compared as `remove` would do.
+                groups = self._scene._mesh_groups
+                groups[:] = [other for other in groups if other is not batch]
                 self._taken_over |= {(int(body), batch.group_id) for body in batch.body_ids}
 
     def _build(self, sim: Any, fields: set[str]) -> None:

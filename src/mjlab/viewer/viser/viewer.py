@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 import viser
 
+from mjlab.sensor import CameraSensor
 from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction
 from mjlab.viewer.camera import resolve_camera
 from mjlab.viewer.history import TermHistory
 from mjlab.viewer.model_sync import host_model
+from mjlab.viewer.viser.camera_feeds import CameraFeeds
 from mjlab.viewer.viser.checkpoints import CheckpointPanel
 from mjlab.viewer.viser.controls import SimulationControls
 from mjlab.viewer.viser.reward_bars import RewardBarPanel
@@ -79,6 +81,7 @@ class ViserPlayViewer(BaseViewer):
         self._history_env: int | None = None
         self._scene: MjlabViserScene | None = None
         self._controls: SimulationControls | None = None
+        self._camera_feeds: CameraFeeds | None = None
         self._reward_bars: RewardBarPanel | None = None
         self._plots: list[tuple[ViserTermPlotter, TermHistory]] = []
         self._checkpoint_panel: CheckpointPanel | None = None
@@ -148,7 +151,10 @@ class ViserPlayViewer(BaseViewer):
             self._next_scene = now + self.scene_period
             self._dirty = False
             self._forget_history_of_other_env()
-            self.scene.draw(self.env.unwrapped.sim, self.env.unwrapped.update_visualizers)
+            sim = self.env.unwrapped.sim
+            self.scene.draw(sim, self.env.unwrapped.update_visualizers)
+            if self._camera_feeds is not None:
+                self._camera_feeds.show(sim, self.scene.env_idx, self.scene.offset)
         if now >= self._next_panels:
             self._next_panels = now + _PANEL_PERIOD_S
             self._update_panels()
@@ -198,6 +204,7 @@ class ViserPlayViewer(BaseViewer):
             with gui.add_folder("Scene"):
                 scene.create_scene_gui()
                 self._add_debug_vis_panel()
+            self._add_camera_feeds()
         with tabs.add_tab("Visualization", icon=viser.Icon.EYE):
             scene.create_overlay_gui()
         with tabs.add_tab("Rewards", icon=viser.Icon.CHART_BAR):
@@ -217,6 +224,18 @@ class ViserPlayViewer(BaseViewer):
                     self._checkpoints,
                     lambda name: self.request_action("fetch_checkpoint", name),
                 )
+
+    def _add_camera_feeds(self) -> None:
+        env = self.env.unwrapped
+        cameras = {
+            name: sensor
+            for name, sensor in getattr(env.scene, "sensors", {}).items()
+            if isinstance(sensor, CameraSensor)
+        }
+        if cameras:
+            self._camera_feeds = CameraFeeds(
+                self._server, cameras, env.sim.mj_model, self.scene.request_redraw
+            )
 
     def _has_metrics(self) -> bool:
         return bool(getattr(self.env.unwrapped.metrics_manager, "active_terms", ()))
@@ -294,4 +313,8 @@ class ViserPlayViewer(BaseViewer):
             env.reset(env_ids=ids)
             if env.command_manager.apply_gui_reset(ids):
                 env.sim.forward()
+                env.sim.sense()
+                # What the reset observed is of the state before.
+                env.observation_manager.reset(ids)
+                env.obs_buf = env.observation_manager.compute(update_history=True, env_ids=ids)
         self.after_reset()

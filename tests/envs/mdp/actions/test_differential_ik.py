@@ -450,6 +450,16 @@ def _shared_arm(factory: Callable[..., Any]) -> Any:
     return _ARMS[0]
 
 
+@pytest.mark.parametrize("fields", [{}, {"use_relative_mode": False}, {"delta_pos_scale": 1e3}])
+@pytest.mark.parametrize("size", [1e20, 3e38])
+def test_the_largest_numbers_overflow_nothing(arm: Any, fields: Any, size: float) -> None:
+    ik = term(arm, **fields)
+    act(ik, [size] * ik.action_dim)
+    dq = ik.compute_dq()
+    assert torch.isfinite(dq).all()
+    assert dq.abs().max() <= 0.5
+
+
 def test_an_unreachable_target_is_approached_in_the_simulation(make_world: Any) -> None:
     arm = make_arm(make_world, num_envs=8)
     ik = term(arm, orientation_weight=0.0, use_relative_mode=False)

@@ -32,6 +32,8 @@ FrameType = Literal["body", "site", "geom"]
 _MIN_DAMPING = 1.0e-6
 # A quaternion shorter than this names no orientation.
 _MIN_QUAT_NORM = 1.0e-6
+# No target is further away than this (m, rad); larger numbers would overflow.
+_FARTHEST = 1.0e6
 _WEIGHTS = ("position_weight", "orientation_weight", "joint_limit_weight", "posture_weight")
 
 
@@ -154,12 +156,12 @@ class DifferentialIKAction(ActionTerm):
         self._raw_actions.copy_(actions)
         cfg, (position, quat) = self.cfg, self._frame_pose()
         if cfg.use_relative_mode:
-            delta = self._raw_actions * self._scale
+            delta = (self._raw_actions * self._scale).clamp_(-_FARTHEST, _FARTHEST)
             position = position + delta[:, :3]
             if self.action_dim == 6:
                 quat = quat_box_plus(quat, delta[:, 3:])
         else:
-            position = self._raw_actions[:, :3]
+            position = self._raw_actions[:, :3].clamp(-_FARTHEST, _FARTHEST)
             if self.action_dim == 7:
                 given = self._raw_actions[:, 3:]
                 is_given = torch.linalg.vector_norm(given, dim=1, keepdim=True) > _MIN_QUAT_NORM

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.envs.mdp.dr._selection import ObjectKind, Selection, select
+from mjlab.envs.mdp.dr._selection import GEOM, ObjectKind, Selection, select
 from mjlab.envs.mdp.dr._types import (
     ABS,
     Distribution,
@@ -123,7 +123,8 @@ def rotate(
     ]
     delta = quat_from_euler_xyz(*angles)
     field = model_field(env, row.field)
-    field[selection.index] = quat_mul(delta, default_values(selection, row.field))
+    new = quat_mul(delta, default_values(selection, row.field))
+    field[selection.index] = keep_absent(selection, new, field)
 
 
 def model_field(env: ManagerBasedRlEnv, field: str) -> torch.Tensor:
@@ -144,6 +145,19 @@ def default_values(selection: Selection, field: str) -> torch.Tensor:
         return default[selection.index]
     block = default[selection.columns]
     return block.expand(len(selection.rows), *block.shape).clone()
+
+
+def keep_absent(selection: Selection, new: torch.Tensor, field: torch.Tensor) -> torch.Tensor:
+    """Return `new` (R, C, ...), with the present values for geoms that are not there.
+
+    Where an entity has variants, an environment may lack geoms of the model. What keeps them out
+    of contacts and pictures stands in their fields.
+    """
+    absent = selection.env.sim.absent_geoms if selection.kind is GEOM else None
+    if absent is None:
+        return new
+    mask = absent[selection.index]
+    return torch.where(mask.view(*mask.shape, *[1] * (new.ndim - 2)), field[selection.index], new)
 
 
 def _width(env: ManagerBasedRlEnv, field: str) -> int | None:
@@ -214,7 +228,7 @@ def _write(
             rnd[..., axis] = sample
         else:
             rnd = sample
-    new = op.combine(base, rnd)
+    new = keep_absent(selection, op.combine(base, rnd), field)
     if row.unit:
         field[selection.index] = _normalized(row, new)
     elif has_axes:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import torch
 
-from mjlab.envs.mdp.dr._core import model_field
+from mjlab.envs.mdp.dr._core import keep_absent, model_field
 
 if TYPE_CHECKING:
     from mjlab.envs.mdp.dr._selection import Selection
@@ -53,13 +53,15 @@ def refresh_geom_bounds(selection: Selection) -> None:
     sizes, radii = model_field(env, "geom_size"), model_field(env, "geom_rbound")
     boxes = model_field(env, "geom_aabb")
     types = torch.as_tensor(env.sim.mj_model.geom_type, device=env.device)[selection.columns]
-    rows = selection.rows[:, None]
+    new_radii, new_boxes = radii[selection.index], boxes.flatten(2)[selection.index]
     for kind in types.unique().tolist():
-        index = rows, selection.columns[types == kind][None, :]
+        index = selection.rows[:, None], selection.columns[types == kind][None, :]
         radius, half = _bounds(kind, sizes[index])
-        radii[index] = radius
+        new_radii[:, types == kind] = radius
         # The box is (centre, half sizes); the centre of a primitive does not move.
-        boxes.flatten(2)[(*index, slice(3, 6))] = half
+        new_boxes[:, types == kind, 3:6] = half
+    radii[selection.index] = keep_absent(selection, new_radii, radii)
+    boxes.flatten(2)[selection.index] = keep_absent(selection, new_boxes, boxes.flatten(2))
 
 
 def _bounds(kind: int, size: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

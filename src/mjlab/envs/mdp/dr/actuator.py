@@ -179,7 +179,7 @@ def effort_limits(
             values = samples
             if op is ABS and place.field == "actuator_ctrlrange":
                 # Efforts are controls times the gain, which only motors of the XML have.
-                gains = env.sim.get_default_field("actuator_gainprm")[columns, 0]
+                gains = _default(env, selected.rows, columns, "actuator_gainprm", 0)
                 values = samples / gains.abs()
             _write(env, selected.rows, columns, place, op, values)
 
@@ -303,6 +303,16 @@ def _scale_or_abs(operation: Operation | str, function: str) -> Operation:
     return op
 
 
+def _default(
+    env: ManagerBasedRlEnv, rows: torch.Tensor, columns: torch.Tensor, field: str, axis: int
+) -> torch.Tensor:
+    """Return compile-time values, (C,) or, where variants differ in them, (R, C)."""
+    default = env.sim.get_default_field(field)
+    if field in env.sim.per_world_default_fields:
+        return default[rows[:, None], columns[None, :], axis]
+    return default[columns, axis]
+
+
 def _write(
     env: ManagerBasedRlEnv,
     rows: torch.Tensor,
@@ -312,7 +322,7 @@ def _write(
     samples: torch.Tensor,
 ) -> None:
     if op is SCALE:
-        samples = env.sim.get_default_field(place.field)[columns, place.axis] * samples
+        samples = _default(env, rows, columns, place.field, place.axis) * samples
     else:
         samples = place.sign * samples
     model_field(env, place.field)[rows[:, None], columns[None, :], place.axis] = samples

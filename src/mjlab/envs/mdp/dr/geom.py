@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from mjlab.envs.mdp.dr._choice import choose_ids
-from mjlab.envs.mdp.dr._core import model_field
+from mjlab.envs.mdp.dr._core import keep_absent, model_field
 from mjlab.envs.mdp.dr._selection import GEOM, MATERIAL, select
 from mjlab.envs.mdp.dr._terms import ROBOT, field_term, rotation_term
 from mjlab.managers.event_manager import requires_model_fields
@@ -42,4 +42,6 @@ def geom_matid(
     """
     geoms = select(env, env_ids, asset_cfg, GEOM)
     materials = select(env, env_ids, asset_cfg, MATERIAL)
-    model_field(env, "geom_matid")[geoms.index] = choose_ids(geoms, materials, shared_random)
+    field = model_field(env, "geom_matid")
+    chosen = choose_ids(geoms, materials, shared_random)
+    field[geoms.index] = keep_absent(geoms, chosen, field)

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from mjlab.envs.mdp._indexing import columns, num_selected
+from mjlab.envs.mdp._checks import nearest, require_command
+from mjlab.envs.mdp._indexing import columns
+from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.tasks.manipulation.mdp.commands import LiftingCommand, MultiCubeLiftingCommand
 from mjlab.tasks.manipulation.mdp.reach import check_reach
-from mjlab.tasks.velocity.mdp.sensor_checks import nearest, require_command
 
 if TYPE_CHECKING:
     import torch
 
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
-    from mjlab.managers.scene_entity_config import SceneEntityCfg
     from mjlab.tasks.manipulation.mdp.goal_command import GoalCommand
 
 C = TypeVar("C", bound="GoalCommand")
+
+DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
+"""The entity whose site terms take for the hand unless they are told."""
 
 
 def lifting_command(env: ManagerBasedRlEnv, name: str) -> LiftingCommand:
@@ -73,14 +76,29 @@ def check_site(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> str:
     """Return the name of the one selected site; raises `ValueError` if it is not one."""
     check_entity(env, asset_cfg.name, "asset_cfg.name")
     names = env.scene.entities[asset_cfg.name].site_names
-    count = num_selected(asset_cfg.site_ids, len(names))
-    if count != 1 or not asset_cfg.site_names:
+    ids = asset_cfg.site_ids
+    selected = list(names[ids]) if isinstance(ids, slice) else [names[index] for index in ids]
+    if len(selected) != 1:
         raise ValueError(
-            f"asset_cfg selects {count} sites of entity {asset_cfg.name!r}; the term needs one, such "
-            f"as the site between the fingers. Give it as site_names; there are {list(names)}."
+            f"asset_cfg selects {len(selected)} sites of entity {asset_cfg.name!r}; the term needs "
+            "one, such as the site between the fingers. Give it as site_names; there are "
+            f"{list(names)}."
         )
-    (name,) = asset_cfg.site_names
-    return name
+    return selected[0]
+
+
+def check_single_with_hand(
+    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG, **params: Any
+) -> None:
+    """Check a term about a hand, one object and its goal."""
+    check_single(env, asset_cfg=asset_cfg, **params)
+
+
+def check_multi_with_hand(
+    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG, **params: Any
+) -> None:
+    """Check a term about a hand, one object of several and its goal."""
+    check_multi(env, asset_cfg=asset_cfg, **params)
 
 
 def check_single(

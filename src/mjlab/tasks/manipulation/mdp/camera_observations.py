@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import torch
 
+from mjlab.envs.mdp._checks import require_command, require_sensor
 from mjlab.managers.build_checks import checked_when_built
 from mjlab.sensor import CameraSensor
 from mjlab.tasks.manipulation.mdp._shared import multi_cube_command
-from mjlab.tasks.velocity.mdp.sensor_checks import require_command, require_sensor
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mjlab.tasks.velocity.mdp.command_checks import check_range
+from mjlab.envs.mdp._checks import check_range
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.envs.mdp._checks import require_command
 from mjlab.envs.mdp._indexing import columns
 from mjlab.managers.build_checks import checked_when_built
 from mjlab.managers.scene_entity_config import SceneEntityCfg
@@ -30,7 +31,6 @@ from mjlab.tasks.manipulation.mdp.camera_observations import (
 from mjlab.tasks.manipulation.mdp.camera_observations import (
     camera_target_cube_mask as camera_target_cube_mask,
 )
-from mjlab.tasks.velocity.mdp.sensor_checks import require_command
 from mjlab.utils.lab_api.math import quat_apply_inverse
 
 if TYPE_CHECKING:

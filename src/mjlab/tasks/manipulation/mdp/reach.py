@@ -38,7 +38,9 @@ def reach(model: mujoco.MjModel, site: str) -> tuple[np.ndarray, float] | None:
             if kind == mujoco.mjtJoint.mjJNT_SLIDE:
                 if not model.jnt_limited[joint]:
                     return None
-                length += float(np.abs(model.jnt_range[joint]).max())
+                # A range is of the joint's position, which is not 0 where the model puts it.
+                start = model.qpos0[model.jnt_qposadr[joint]]
+                length += float(np.abs(model.jnt_range[joint] - start).max())
                 continue
             anchor = data.xanchor[joint].copy()
             # What lies between the site and the last joint is turned as a whole; so is all else.

@@ -6,7 +6,7 @@ substep, of hand and object alike.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -15,7 +15,9 @@ from mjlab.managers.build_checks import checked_when_built
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.tasks.manipulation.mdp._shared import (
     check_multi,
+    check_multi_with_hand,
     check_single,
+    check_single_with_hand,
     lifting_command,
     multi_cube_command,
     site_pos,
@@ -28,7 +30,7 @@ if TYPE_CHECKING:
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 
 
-@checked_when_built(check_single)
+@checked_when_built(check_single_with_hand)
 def staged_position_reward(
     env: ManagerBasedRlEnv,
     command_name: str,
@@ -58,7 +60,7 @@ def bring_object_reward(
     return _closeness(target.data.root_link_pos_w, goal, std)
 
 
-@checked_when_built(check_multi)
+@checked_when_built(check_multi_with_hand)
 def multi_cube_staged_position_reward(
     env: ManagerBasedRlEnv,
     command_name: str,
@@ -82,6 +84,12 @@ def multi_cube_bring_object_reward(
     return _closeness(command.target_object_pos(), command.target_pos, std)
 
 
+def _check_max_vel(env: ManagerBasedRlEnv, max_vel: float, **_: Any) -> None:
+    if not max_vel >= 0.0:
+        raise ValueError(f"max_vel is {max_vel!r}; it is a speed, at least 0.")
+
+
+@checked_when_built(_check_max_vel)
 def joint_velocity_hinge_penalty(
     env: ManagerBasedRlEnv, max_vel: float, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
 ) -> torch.Tensor:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mjlab.tasks.tracking.mdp.motion_command import MotionCommandCfg
 
 _MODES = ("adaptive", "uniform", "start")
+_DRAWINGS = ("ghost", "frames")
 
 
 def check_command_cfg(cfg: MotionCommandCfg) -> None:
@@ -33,6 +34,8 @@ def check_command_cfg(cfg: MotionCommandCfg) -> None:
         )
     if cfg.sampling_mode not in _MODES:
         raise ValueError(f"sampling_mode is {cfg.sampling_mode!r}; it is one of {_MODES}.")
+    if cfg.viz.mode not in _DRAWINGS:
+        raise ValueError(f"viz.mode is {cfg.viz.mode!r}; it is one of {_DRAWINGS}.")
     for name in ("pose_range", "velocity_range"):
         _check_ranges(name, getattr(cfg, name))
     _check_range("joint_position_range", cfg.joint_position_range)

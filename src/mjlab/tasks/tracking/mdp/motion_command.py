@@ -112,7 +112,7 @@ class MotionCommand(MotionReader, CommandTerm):
     # What the config and the files say, and what lasts no longer than a call.
     _transient = {
         "scene", "robot", "body_names", "body_indexes", "anchor_index", "anchor_body", "motion_files",
-        "_num_bins", "_moved",
+        "_num_bins", "_moved", "_started",
     }  # fmt: skip
 
     def __init__(self, cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> None:
@@ -146,6 +146,11 @@ class MotionCommand(MotionReader, CommandTerm):
         # The step in which a failure was last counted, so that none is counted twice.
         self._counted_at = torch.full_like(self.time_steps, -1)
         self._moved: list[torch.Tensor] = []
+        self._started: list[torch.Tensor] = []
+        # Frames are of motions with these lengths: by their shapes, the state of a run on other
+        # motions is refused, whose frames may not exist here.
+        lengths = self.motion.lengths.tolist()
+        self._extent = [torch.empty(count, 0) for count in (len(lengths), *lengths)]
         self.drawing = MotionDrawing(self)
         self._panel: MotionPanel | None = None
 
@@ -195,9 +200,11 @@ class MotionCommand(MotionReader, CommandTerm):
 
         Writes the robot's state; what derives from it is stale until `sim.forward()`.
         """
-        log = super().reset(as_ids(env_ids, self.num_envs, self.device))
+        ids = as_ids(env_ids, self.num_envs, self.device)
+        log = super().reset(ids)
         # The environment runs forward after its resets.
         self._moved.clear()
+        self._started.append(ids)
         return log
 
     def reset_to_frame(self, env_ids: torch.Tensor, frame: int) -> None:
@@ -282,8 +289,17 @@ class MotionCommand(MotionReader, CommandTerm):
         super().compute(dt, env_ids)
         if self.sampler is not None and env_ids is None:
             self.sampler.end_step()
+        if self._panel is not None:
+            # Also where the reference is not drawn.
+            self._panel.update()
 
     def _update_metrics(self) -> None:
+        if self._started:
+            # Their relative poses are still those of before the reset.
+            ids = torch.cat(self._started)
+            pos, quat = self.relative_poses(ids)
+            self.body_pos_relative_w[ids], self.body_quat_relative_w[ids] = pos, quat
+            self._started.clear()
         for name, value in tracking_metrics(self).items():
             self.metrics[name].copy_(value)
 
@@ -325,12 +341,17 @@ class MotionCommand(MotionReader, CommandTerm):
             self._panel.set_paused(paused)
 
     def apply_gui_reset(self, env_ids: torch.Tensor) -> bool:
-        """Put these environments exactly onto the frame that the panel asks for, if it does."""
+        """Put these environments exactly onto the frame that the panel asks for, if it does.
+
+        As after every reset, the reference is a frame ahead then.
+        """
         chosen = None if self._panel is None else self._panel.take_start()
         if chosen is None:
             return False
         self.motion_ids[env_ids], frame = chosen
         self.reset_to_frame(env_ids, frame)
+        last = self.motion.lengths[self.motion_ids[env_ids]] - 1
+        self.time_steps[env_ids] = (self.time_steps[env_ids] + 1).minimum(last)
         self._env.sim.forward()
         self.update_relative_body_poses()
         return True

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from mjlab.tasks.tracking.motion_file import Motion, read_motion
+from mjlab.tasks.tracking.motion_file import Motion, MotionFileError, read_motion
 
 _PER_BODY = ("body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w")
 _PER_JOINT = ("joint_pos", "joint_vel")
@@ -44,7 +44,15 @@ class MotionLoader:
         Raises:
             MotionFileError: the file is no motion, or has fewer bodies.
         """
-        self._take(read_motion(motion_file), body_indexes, device)
+        motion = read_motion(motion_file)
+        bodies = motion.body_pos_w.shape[1]
+        unknown = [i for i in body_indexes.tolist() if not 0 <= i < bodies]
+        if unknown:
+            raise MotionFileError(
+                f"The motion {motion_file} has {bodies} bodies, and not those of the indexes "
+                f"{unknown}."
+            )
+        self._take(motion, body_indexes, device)
 
     @classmethod
     def from_motion(

@@ -86,6 +86,9 @@ class MotionPanel:
     def take_start(self) -> tuple[int, int] | None:
         """Return the motion and the frame that the button asked for, once; else None."""
         start, self._start = self._start, None
+        if start is not None:
+            # The robot follows to where the reference was moved, and what was chosen is done.
+            self._wanted, self._was_moved = None, False
         return start
 
     def update(self) -> None:

@@ -146,7 +146,9 @@ class MotionReader:
         """(N, 3) angular velocity of the robot's anchor."""
         return self.robot_body_ang_vel_w[:, self.anchor_index]
 
-    def relative_poses(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def relative_poses(
+        self, env_ids: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the reference carried to the robot's x, y and heading, at its own height.
 
         With anchors (p, q) of the reference and (p', q') of the robot, both as they are now, and D
@@ -154,14 +156,21 @@ class MotionReader:
 
             q_rel = D q_body,   p_rel = (p'_x, p'_y, p_z) + D (p_body - p).
 
+        Args:
+            env_ids: (n,) int64, the environments that are meant; None means all.
+
         Returns:
-            Positions (N, K, 3) and orientations (N, K, 4).
+            Positions (n, K, 3) and orientations (n, K, 4).
         """
         body_pos, body_quat = self.body_pos_w, self.body_quat_w
+        robot_pos, robot_quat = self.robot_anchor_pos_w, self.robot_anchor_quat_w
+        if env_ids is not None:
+            body_pos, body_quat = body_pos[env_ids], body_quat[env_ids]
+            robot_pos, robot_quat = robot_pos[env_ids], robot_quat[env_ids]
         anchor_pos, anchor_quat = body_pos[:, self.anchor_index], body_quat[:, self.anchor_index]
-        turn = yaw_quat(quat_mul(self.robot_anchor_quat_w, quat_inv(anchor_quat)))
+        turn = yaw_quat(quat_mul(robot_quat, quat_inv(anchor_quat)))
         turn = turn[:, None].expand(-1, body_pos.shape[1], -1)
-        place = torch.cat((self.robot_anchor_pos_w[:, :2], anchor_pos[:, 2:]), dim=1)
+        place = torch.cat((robot_pos[:, :2], anchor_pos[:, 2:]), dim=1)
         pos = quat_apply(turn, body_pos - anchor_pos[:, None]).add_(place[:, None])
         return pos, quat_mul(turn, body_quat)
 

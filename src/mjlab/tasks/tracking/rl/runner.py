@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mjlab.rl.exporting_runner import ExportingOnPolicyRunner
 from mjlab.rl.onnx_export import export_to_onnx
 from mjlab.rl.rsl import VecEnv
-from mjlab.rl.runner import MjlabOnPolicyRunner
 from mjlab.tasks.tracking.mdp.motion_command import MotionCommand
 from mjlab.tasks.tracking.motion_record import record_motions
 from mjlab.tasks.tracking.rl.onnx_model import PolicyWithReference
@@ -20,15 +20,13 @@ logger = logging.getLogger(__name__)
 _FAILURES = "motion_failures"
 
 
-class MotionTrackingOnPolicyRunner(MjlabOnPolicyRunner):
+class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
     """Trains as `MjlabOnPolicyRunner` does, exports the policy with the reference whenever it saves,
     and keeps the motions in the run's folder.
 
     Checkpoints hold the statistics of failures, so that a run that resumes, with however many
     environments, still knows where the robot fails.
     """
-
-    exports_on_save = True
 
     def __init__(
         self,
@@ -80,7 +78,6 @@ class MotionTrackingOnPolicyRunner(MjlabOnPolicyRunner):
             self._keep_motions(folder)
         except Exception as error:
             logger.warning("The motions were not recorded in %s: %s", folder, error)
-        self.export_policy(str(folder / f"{folder.name}.onnx"))
 
     def load(
         self,

@@ -5,12 +5,13 @@ It is `evaluate TASK` with the flags and the figures of mjlab 1.6.
 
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mjlab.scripts.cli import run_command, task_and_flags, task_usage
+from mjlab.scripts.cli import UserError, run_command, task_and_flags, task_usage
 from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
 from mjlab.scripts.policy import parse_policy_flags
 from mjlab.tasks.tracking.evaluation import TRACKING_ERRORS
@@ -44,9 +45,16 @@ def run_evaluate_tracking(task: str, cfg: EvaluateTrackingConfig) -> dict[str, f
 
     Raises:
         ValueError: the task does not track motions.
+        UserError: `num_episodes` is given, which is always `num_envs` here.
     """
     if "Tracking" not in task:
         raise ValueError(f"{task!r} does not track motions; `evaluate {task}` scores its policies.")
+    if cfg.num_episodes != EvaluateConfig.num_episodes:
+        raise UserError(
+            f"--num-episodes is {cfg.num_episodes}, but here each environment plays one episode; "
+            f"give --num-envs {cfg.num_episodes} instead."
+        )
+    cfg = copy.copy(cfg)
     cfg.num_episodes = cfg.num_envs
     figures = run_evaluate(task, cfg)
     means: dict[str, float] = {"success_rate": figures["success_rate"]}

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mjlab.envs.mdp._checks import check_range
 
 if TYPE_CHECKING:
     from mjlab.tasks.velocity.mdp.velocity_command import UniformVelocityCommandCfg
@@ -17,19 +18,6 @@ _PROBABILITIES = (
     "rel_forward_envs",
     "init_velocity_prob",
 )
-
-
-def check_range(label: str, bounds: Any) -> None:
-    """Raise `ValueError` unless `bounds` are two finite numbers, the smaller one first."""
-    try:
-        low, high = (float(bound) for bound in bounds)
-    except (TypeError, ValueError):
-        low, high = math.nan, math.nan
-    if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-        turned = " They are the wrong way round." if low > high else ""
-        raise ValueError(
-            f"{label} is {bounds!r}; it has to be two finite numbers, the smaller one first.{turned}"
-        )
 
 
 def check_command_cfg(cfg: UniformVelocityCommandCfg) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.envs.mdp._checks import require_command
 from mjlab.envs.mdp._indexing import columns
 from mjlab.managers.build_checks import checked_when_built
 from mjlab.managers.scene_entity_config import SceneEntityCfg
@@ -21,7 +22,6 @@ from mjlab.tasks.velocity.mdp.sensor_checks import (
     check_same_feet,
     contact_columns,
     height_columns,
-    require_command,
     site_columns,
 )
 

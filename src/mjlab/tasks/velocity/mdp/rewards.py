@@ -12,6 +12,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.compat import older_names
+from mjlab.envs.mdp._checks import (
+    check_contact_sensor,
+    check_std,
+    require_command,
+    require_sensor,
+)
 from mjlab.envs.mdp._indexing import columns
 from mjlab.managers.build_checks import checked_when_built
 from mjlab.managers.scene_entity_config import SceneEntityCfg
@@ -29,13 +35,7 @@ from mjlab.tasks.velocity.mdp.feet_rewards import feet_clearance as feet_clearan
 from mjlab.tasks.velocity.mdp.feet_rewards import feet_slip as feet_slip
 from mjlab.tasks.velocity.mdp.feet_rewards import feet_swing_height as feet_swing_height
 from mjlab.tasks.velocity.mdp.feet_rewards import soft_landing as soft_landing
-from mjlab.tasks.velocity.mdp.sensor_checks import (
-    check_builtin_sensor,
-    check_contact_sensor,
-    check_std,
-    require_command,
-    require_sensor,
-)
+from mjlab.tasks.velocity.mdp.sensor_checks import check_builtin_sensor
 from mjlab.tasks.velocity.mdp.terrain_utils import terrain_normal_from_sensors
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
 from mjlab.utils.lab_api.string import resolve_matching_names_values

@@ -1,66 +1,17 @@
-"""What the terms of a walking robot ask of its sensors and commands, checked when they are built."""
+"""What the terms of a walking robot ask of its sensors, checked when they are built."""
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
+from mjlab.envs.mdp._checks import require_fields, require_sensor
 from mjlab.sensor import BuiltinSensor, ContactSensor, TerrainHeightSensor
-from mjlab.utils.string import name_list
 
 if TYPE_CHECKING:
     import mujoco
 
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.managers.scene_entity_config import SceneEntityCfg
-
-S = TypeVar("S")
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Return what to say about the names that exist: the nearest ones, or all if they are few."""
-    names = list(known)
-    close = difflib.get_close_matches(name, names)
-    if close:
-        return f"Did you mean {' or '.join(map(repr, close))}?"
-    return f"There are: {name_list(names, near=())}."
-
-
-def require_sensor(env: ManagerBasedRlEnv, name: str, kind: type[S]) -> S:
-    """Return a sensor of the scene.
-
-    Raises:
-        ValueError: there is no such sensor; the message names the nearest ones.
-        TypeError: it is of another kind.
-    """
-    sensors = env.scene.sensors
-    if name not in sensors:
-        # A contact sensor is made of MuJoCo's own, one for each of its parts, that nobody asks for.
-        contacts = tuple(f"{n}_" for n, s in sensors.items() if isinstance(s, ContactSensor))
-        known = [n for n in sensors if not n.startswith(contacts)]
-        raise ValueError(f"The scene has no sensor {name!r}. {nearest(name, known)}")
-    sensor: Any = sensors[name]
-    if not isinstance(sensor, kind):
-        same_kind = [other for other, s in sensors.items() if isinstance(s, kind)]
-        raise TypeError(
-            f"The sensor {name!r} is a {type(sensor).__name__}, and a {kind.__name__} is needed. "
-            f"Such are: {same_kind}."
-        )
-    return sensor
-
-
-def require_command(env: ManagerBasedRlEnv, name: str | None) -> None:
-    """Raise `ValueError` unless there is a command of that name, or `name` is None."""
-    names = env.command_manager.active_terms
-    if name is not None and name not in names:
-        raise ValueError(f"There is no command {name!r}. {nearest(name, names)}")
-
-
-def check_std(std: float) -> None:
-    """Raise `ValueError` unless a standard deviation is positive."""
-    if not std > 0.0:
-        raise ValueError(f"std is {std!r}; it has to be positive.")
 
 
 def check_builtin_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
@@ -74,31 +25,14 @@ def check_builtin_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> 
         )
 
 
-def _require_fields(sensor: ContactSensor, *fields: str) -> None:
-    missing = [field for field in fields if field not in sensor.cfg.fields]
-    if missing:
-        raise ValueError(
-            f"The contact sensor {sensor.cfg.name!r} has no {missing}. Add them to its fields, "
-            f"which are {tuple(sensor.cfg.fields)}."
-        )
-
-
-def check_contact_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
-    """Check a term that counts contacts, or forces in a history."""
-    sensor = require_sensor(env, sensor_name, ContactSensor)
-    has_history = sensor.cfg.history_length > 0 and "force" in sensor.cfg.fields
-    if not has_history:
-        _require_fields(sensor, "found")
-
-
 def check_found_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
     """Check a term that asks whether there is contact."""
-    _require_fields(require_sensor(env, sensor_name, ContactSensor), "found")
+    require_fields(require_sensor(env, sensor_name, ContactSensor), "found")
 
 
 def check_force_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
     """Check a term that reads forces of contacts."""
-    _require_fields(require_sensor(env, sensor_name, ContactSensor), "force")
+    require_fields(require_sensor(env, sensor_name, ContactSensor), "force")
 
 
 def check_air_time_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
@@ -128,7 +62,7 @@ def check_feet_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> Non
             "and the term needs one. Set num_slots=1, with reduce='netforce' for the sum of all "
             "contacts of a foot."
         )
-    _require_fields(sensor, "found")
+    require_fields(sensor, "found")
 
 
 def check_landing_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from mjlab.managers.build_checks import checked_when_built
+from mjlab.envs.mdp.terminations import illegal_contact as illegal_contact
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.tasks.velocity.mdp.sensor_checks import check_contact_sensor
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -17,22 +16,6 @@ if TYPE_CHECKING:
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 # Positions are those of before the reset until the second step of an episode.
 _MIN_STEPS = 2
-
-
-@checked_when_built(check_contact_sensor)
-def illegal_contact(
-    env: ManagerBasedRlEnv, sensor_name: str, force_threshold: float = 10.0
-) -> torch.Tensor:
-    """Something touches what it should not.
-
-    With a history of forces: any force above `force_threshold` (N) in any of those last substeps.
-    Without one: any contact.
-    """
-    data = env.scene[sensor_name].data
-    if data.force_history is None:
-        return (data.found > 0).any(dim=1)
-    hits = data.force_history.square().sum(dim=-1) > force_threshold**2
-    return hits.flatten(start_dim=1).any(dim=1)
 
 
 def out_of_terrain_bounds(

@@ -1,0 +1,229 @@
+"""Rendering on the Warp engine, with MuJoCo Warp's batch renderer."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Collection
+from contextlib import AbstractContextManager
+from typing import Any
+
+import mujoco
+import mujoco_warp
+import numpy as np
+import torch
+import warp
+
+from mjlab.sim.rendering import LENS_FIELDS, CameraView, Images
+
+# A type checker cannot follow how these two packages annotate their arrays.
+mjwarp: Any = mujoco_warp
+wp: Any = warp
+
+
+# What a context depends on besides, where environments differ in it.
+_CONTEXT_FIELDS = LENS_FIELDS | {"light_attenuation", "light_type", "geom_dataid"}
+_MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
+
+Launch = Callable[[str, Callable[[], None]], None]
+"""Runs work by replaying its graph."""
+
+
+class WarpRenderer:
+    """Renders the views of a Warp engine.
+
+    MuJoCo Warp keeps geom groups, textures and shadows with a render context, which renders all
+    its cameras at once; so there is one for all views that agree in these.
+    """
+
+    def __init__(
+        self,
+        host: mujoco.MjModel,
+        model: Any,
+        data: Any,
+        ordered: Callable[[], AbstractContextManager[None]],
+        launch: Launch,
+    ) -> None:
+        """Render the worlds of `data`.
+
+        `host` is the model on the host; Warp's work is done within `ordered()`, or by `launch`.
+        """
+        self._host, self._model, self._data = host, model, data
+        self._ordered, self._launch = ordered, launch
+        self._scenes: dict[Any, _Scene] = {}
+        # A graph's name is used once, so that none is replayed for another context.
+        self._numbers = itertools.count()
+
+    def render(self, views: tuple[CameraView, ...], expanded: Collection[str]) -> list[Images]:
+        """Render views at the poses that derived fields have; see `Engine.render`.
+
+        `expanded` are the names of the model fields that differ between environments.
+        """
+        images: dict[int, Images] = {}
+        for scene in self._scenes_of(views, frozenset(expanded)):
+            images.update(scene.render(self._model, self._data))
+        return [images[i] for i in range(len(views))]
+
+    def context_of(self, views: tuple[CameraView, ...], view: CameraView) -> Any:
+        """Return the `mujoco_warp.RenderContext` that has rendered `view` last, one of `views`."""
+        for key, scene in self._scenes.items():
+            if key[0] == views and view in scene.views.values():
+                return scene.context
+        raise RuntimeError("The view has not been rendered yet; call Simulation.sense() first.")
+
+    def _scenes_of(self, views: tuple[CameraView, ...], expanded: frozenset[str]) -> list[_Scene]:
+        by_settings: dict[Any, dict[int, CameraView]] = {}
+        for i, view in enumerate(views):
+            settings = (view.geom_groups, view.use_textures, view.use_shadows)
+            by_settings.setdefault(settings, {})[i] = view
+        scenes = []
+        relevant = expanded & _CONTEXT_FIELDS
+        for settings, members in by_settings.items():
+            key = (views, settings)
+            if key not in self._scenes or self._scenes[key].expanded != relevant:
+                # Images that are made here are written into in later calls, in whatever mode.
+                with self._ordered(), torch.inference_mode(False):
+                    self._scenes[key] = _Scene(
+                        self._host,
+                        self._model,
+                        self._data.nworld,
+                        members,
+                        relevant,
+                        self._ordered,
+                        self._launch,
+                        f"render {next(self._numbers)}",
+                    )
+            scenes.append(self._scenes[key])
+        return scenes
+
+
+class _Scene:
+    """One render context, and the views that are rendered with it."""
+
+    def __init__(
+        self,
+        host: mujoco.MjModel,
+        model: Any,
+        num_worlds: int,
+        views: dict[int, CameraView],
+        expanded: frozenset[str],
+        ordered: Callable[[], AbstractContextManager[None]],
+        launch: Launch,
+        name: str,
+    ) -> None:
+        self.views, self.expanded = views, expanded
+        self._ordered, self._launch, self._name = ordered, launch, name
+        self._is_loaded = False
+        members = list(views.values())
+        first = members[0]
+        # MuJoCo counts a group beyond 0 to 5 as the nearest of these.
+        groups = np.unique(host.geom_group)
+        groups = groups[np.isin(groups.clip(0, 5), first.geom_groups)]
+        self.context = None
+        if len(groups):
+            self.context = self._make_context(host, num_worlds, members, groups.tolist())
+        self._dataid: Any = None
+        if "geom_dataid" in expanded and self.context is not None:
+            self._dataid = _without_absent_meshes(host, model, self.context)
+        self._images = self._read_images(num_worlds)
+
+    def _make_context(
+        self, host: mujoco.MjModel, num_worlds: int, views: list[CameraView], groups: list[int]
+    ) -> Any:
+        first = views[0]
+        context = mjwarp.create_render_context(
+            host,
+            num_worlds,
+            cam_res=[(view.width, view.height) for view in views],
+            render_rgb=["rgb" in view.data_types for view in views],
+            render_depth=["depth" in view.data_types for view in views],
+            render_seg=["segmentation" in view.data_types for view in views],
+            cam_active=[view.camera_id for view in views],
+            use_textures=first.use_textures,
+            use_shadows=first.use_shadows,
+            enabled_geom_groups=groups,
+            render_skybox=True,
+            use_precomputed_rays=LENS_FIELDS.isdisjoint(self.expanded),
+            # Faces of meshes are flat on both engines; rays of MuJoCo know no others.
+            enable_vertex_normals=False,
+        )
+        # The model says what may be left out; environments may differ from it.
+        if "light_attenuation" in self.expanded:
+            context.light_attenuation_is_default = False
+        if "light_type" in self.expanded:
+            context.has_spot_lights = True
+        return context
+
+    def _read_images(self, num_worlds: int) -> dict[int, Images]:
+        """View the context's buffers as images. Colours are packed there, and get their own."""
+        rc = self.context
+        device = wp.device_to_torch(wp.get_device())
+        images = {i: Images.empty(view, num_worlds, device) for i, view in self.views.items()}
+        self._packed: list[tuple[torch.Tensor, torch.Tensor]] = []
+        if rc is None:
+            return images
+        buffers = {"rgb": rc.rgb_data, "depth": rc.depth_data, "segmentation": rc.seg_data}
+        place = dict.fromkeys(buffers, 0)
+        for i, view in self.views.items():
+            count = view.width * view.height
+            for name in view.data_types:
+                pixels = wp.to_torch(buffers[name])[:, place[name] : place[name] + count]
+                place[name] += count
+                shape = (view.height, view.width)
+                if name == "rgb":
+                    # Blue, green, red and alpha, from the first byte of each number on.
+                    parts = pixels.view(torch.uint8).view(num_worlds, count, 4).unflatten(1, shape)
+                    rgb = images[i].rgb
+                    assert rgb is not None
+                    self._packed.append((parts, rgb))
+                elif name == "depth":
+                    images[i].depth = pixels.unflatten(1, shape)[..., None]
+                else:
+                    images[i].segmentation = pixels.unflatten(1, shape)
+        return images
+
+    def render(self, model: Any, data: Any) -> dict[int, Images]:
+        """Render all views at the current poses."""
+        if self.context is None:
+            return self._images
+        if self._dataid is not None:
+            model = dataclasses.replace(model, geom_dataid=self._dataid)
+
+        def work() -> None:
+            mjwarp.refit_bvh(model, data, self.context)
+            mjwarp.render(model, data, self.context)
+
+        if self._is_loaded and data.qpos.device.is_cuda:
+            self._launch(self._name, work)
+        else:
+            # Kernels are loaded by the first call, because older drivers cannot load them during a
+            # capture; and on the CPU a capture leaves out what fills arrays.
+            with self._ordered():
+                work()
+            self._is_loaded = True
+        for parts, rgb in self._packed:
+            for channel in range(3):
+                rgb[..., channel] = parts[..., 2 - channel]
+        return self._images
+
+
+def _without_absent_meshes(host: mujoco.MjModel, model: Any, context: Any) -> Any:
+    """Return `geom_dataid` for `context`, with a mesh that nobody sees in place of none at all.
+
+    MuJoCo Warp would look up the mesh -1. The one that is added to the context is a point.
+    """
+    is_mesh = torch.as_tensor(host.geom_type == _MESH, device=wp.device_to_torch(wp.get_device()))
+    dataid = wp.to_torch(model.geom_dataid)
+    own = torch.where(is_mesh & (dataid < 0), host.nmesh, dataid).to(torch.int32).contiguous()
+    if not (own == host.nmesh).any():
+        return None
+    point = wp.Mesh(points=wp.zeros(3, dtype=wp.vec3), indices=wp.array([0, 1, 2], dtype=wp.int32))
+    context.mesh_registry[point.id] = point
+    ids = [*context.mesh_bvh_id.numpy().tolist(), point.id]
+    bounds = [*context.mesh_bounds_size.numpy().tolist(), [0.0, 0.0, 0.0]]
+    context.mesh_bvh_id = wp.array(ids, dtype=wp.uint64)
+    context.mesh_bounds_size = wp.array(bounds, dtype=wp.vec3)
+    shared = wp.from_torch(own, dtype=wp.int32)
+    # The array does not keep the tensor whose memory it is.
+    shared.keep = own
+    return shared

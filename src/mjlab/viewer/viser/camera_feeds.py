@@ -1,0 +1,179 @@
+"""What the camera sensors of the selected environment see, beside the scene and within it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+import viser
+import viser.transforms as vtf
+
+from mjlab.sensor import CameraSensor
+from mjlab.viewer.model_sync import to_numpy
+
+# Images are enlarged to this many pixels, unless they became wider than the panel then.
+_WANTED_PIXELS, _PANEL_PIXELS = 128, 384
+# Metres shown white: least, most, step and first value of the slider.
+_RANGE, _STEP, _FIRST_RANGE = (0.1, 10.0), 0.1, 1.0
+_FRUSTUM_LENGTH = 0.08
+_FRUSTUM_COLOR = (250, 176, 5)
+# A camera looks along -z with y up; the page's frustums look along z with y down.
+_TO_FRUSTUM = vtf.SO3(np.array([0.0, 1.0, 0.0, 0.0]))
+
+
+class CameraFeeds:
+    """Shows the images of camera sensors in a folder of the page, and their frustums in the scene."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        sensors: Mapping[str, CameraSensor],
+        model: mujoco.MjModel,
+        request_redraw: Callable[[], None],
+    ) -> None:
+        """Add a folder for each sensor to the current place in the page.
+
+        Args:
+            server: The page's server.
+            sensors: Initialized camera sensors by name.
+            model: The compiled model.
+            request_redraw: Is called when a control was changed.
+        """
+        with server.gui.add_folder("Camera Feeds"):
+            self._feeds = [
+                _Feed(server, name, sensor, model, request_redraw)
+                for name, sensor in sensors.items()
+            ]
+
+    def show(self, sim: Any, env_idx: int, offset: np.ndarray) -> None:
+        """Show the latest images of an environment, whose scene is moved by `offset` (3,)."""
+        for feed in self._feeds:
+            feed.show(sim, env_idx, offset)
+
+
+class _Feed:
+    """One sensor's images and frustum."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        name: str,
+        sensor: CameraSensor,
+        model: mujoco.MjModel,
+        request_redraw: Callable[[], None],
+    ) -> None:
+        self._server, self._name, self._sensor, self._model = server, name, sensor, model
+        self._images: dict[str, viser.GuiImageHandle] = {}
+        self._range: viser.GuiInputHandle[float] | None = None
+        self._frustum: viser.CameraFrustumHandle | None = None
+        gui, view = server.gui, sensor.view
+        blank = enlarged(np.zeros((view.height, view.width, 3), np.uint8))
+        with gui.add_folder(name):
+            for kind in view.data_types:
+                self._images[kind] = gui.add_image(blank, label=kind.capitalize(), format="png")
+                if kind == "depth":
+                    self._range = gui.add_slider(
+                        "White at (m)",
+                        min=_RANGE[0],
+                        max=_RANGE[1],
+                        step=_STEP,
+                        initial_value=_FIRST_RANGE,
+                        hint="What is so far away or farther, or not there, is white.",
+                    )
+                    self._range.on_update(lambda _: request_redraw())
+            self._shows_frustum = gui.add_checkbox(
+                "Frustum", True, hint="Show in the scene what the camera looks at."
+            )
+            self._shows_frustum.on_update(lambda _: request_redraw())
+
+    def show(self, sim: Any, env_idx: int, offset: np.ndarray) -> None:
+        data = self._sensor.data
+        for kind, handle in self._images.items():
+            image = to_numpy(getattr(data, kind)[env_idx])
+            if kind == "depth":
+                assert self._range is not None
+                image = depth_colors(image, float(self._range.value))
+            elif kind == "segmentation":
+                image = segmentation_colors(image)
+            handle.image = enlarged(image)
+        self._show_frustum(sim, env_idx, offset)
+
+    def _show_frustum(self, sim: Any, env_idx: int, offset: np.ndarray) -> None:
+        camera, view = self._sensor.camera_idx, self._sensor.view
+        is_orthographic = self._model.cam_projection[camera] != 0
+        if is_orthographic or not self._shows_frustum.value:
+            if self._frustum is not None:
+                self._frustum.visible = False
+            return
+        aspect = view.width / view.height
+        fovy = float(sim.model.cam_fovy[env_idx, camera])
+        intrinsic = to_numpy(sim.model.cam_intrinsic[env_idx, camera])
+        angle = vertical_angle(fovy, self._model.cam_sensorsize[camera], intrinsic[1], aspect)
+        mat = to_numpy(sim.data.cam_xmat[env_idx, camera]).astype(float)
+        wxyz = (vtf.SO3.from_matrix(mat) @ _TO_FRUSTUM).wxyz
+        position = to_numpy(sim.data.cam_xpos[env_idx, camera]) + offset
+        if self._frustum is None:
+            self._frustum = self._server.scene.add_camera_frustum(
+                f"/cameras/{self._name}",
+                fov=angle,
+                aspect=aspect,
+                scale=_FRUSTUM_LENGTH,
+                thickness=0.002,
+                color=_FRUSTUM_COLOR,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+        self._frustum.fov = angle
+        self._frustum.position, self._frustum.wxyz = position, wxyz
+        self._frustum.visible = True
+
+
+def vertical_angle(fovy: float, sensorsize: np.ndarray, focal: float, aspect: float) -> float:
+    """Return the vertical field of view, in radians, of an image with this width by height.
+
+    Args:
+        fovy: The camera's own, in degrees; for a camera without a sensor.
+        sensorsize: (2,) width and height of the sensor, of which the image's shape is used.
+        focal: Vertical focal length.
+        aspect: Width by height of the image.
+    """
+    width, height = (float(side) for side in sensorsize)
+    if height == 0.0:
+        return math.radians(fovy)
+    return 2.0 * math.atan(min(height, width / aspect) / 2.0 / float(focal))
+
+
+def enlarged(image: np.ndarray) -> np.ndarray:
+    """Enlarge an image (H, W, 3) by a whole factor, to 128 pixels or what fits into the panel."""
+    height, width = image.shape[:2]
+    factor = -(-_WANTED_PIXELS // min(height, width))
+    factor = max(1, min(factor, _PANEL_PIXELS // max(height, width)))
+    return image.repeat(factor, axis=0).repeat(factor, axis=1)
+
+
+def depth_colors(depth: np.ndarray, white: float) -> np.ndarray:
+    """Return grey levels (H, W, 3) of depths (H, W, 1) in metres: black is near.
+
+    What is `white` metres away or farther is white, and so is where there is nothing (0).
+    """
+    brightness = np.clip(np.where(depth > 0.0, depth / white, 1.0), 0.0, 1.0)
+    return np.repeat((255.0 * brightness).astype(np.uint8), 3, axis=-1)
+
+
+def segmentation_colors(objects: np.ndarray) -> np.ndarray:
+    """Return colours (H, W, 3) of objects (H, W, 2), ids and types; black where there is none.
+
+    An object has the same colour in all images, and neighbouring ids have different ones.
+    """
+    ids, kinds = objects[..., 0].astype(np.uint32), objects[..., 1].astype(np.uint32)
+    # Bits of a product with a large odd number are spread out (Knuth's multiplicative hash).
+    mixed = ids * np.uint32(2654435761) + kinds * np.uint32(40503)
+    mixed ^= mixed >> np.uint32(15)
+    mixed *= np.uint32(2246822519)
+    parts = np.stack([(mixed >> np.uint32(shift)) & np.uint32(255) for shift in (24, 14, 4)], -1)
+    colors = (64 + parts * 191 // 255).astype(np.uint8)
+    colors[objects[..., 0] < 0] = 0
+    return colors
