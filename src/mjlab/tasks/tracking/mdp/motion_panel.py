@@ -89,6 +89,7 @@ class MotionPanel:
         if start is not None:
             # The robot follows to where the reference was moved, and what was chosen is done.
             self._wanted, self._was_moved = None, False
+            self._next_table = 0.0
         return start
 
     def update(self) -> None:
