@@ -15,18 +15,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from public_interface import Entry, command_line, entries, problems
 
-# What is not built yet: modules by their beginning, and names of modules that are there.
-LATER_MODULES = (
-)
-LATER_NAMES = {
-}
-LATER = {
-    f"{module}.exports": {f"{name} is not exported" for name in names.split()}
-    for module, names in LATER_NAMES.items()
-} | {
-}
-
-# What is otherwise on purpose.
+# What differs on purpose.
 DEVIATIONS = {
     # Private: how the group finds its actuators.
     "mjlab.actuator.builtin_group.BuiltinActuatorGroup": {"field _index_groups is missing"},
@@ -53,7 +42,6 @@ MISSING_FLAGS = {
 }
 
 ENTRIES = entries()
-TODAY = [entry for entry in ENTRIES if not entry.module.startswith(LATER_MODULES)]
 
 
 def test_the_list_was_read_in_full():
@@ -62,19 +50,12 @@ def test_the_list_was_read_in_full():
     assert sum(len(entry.members) for entry in ENTRIES) > 1400
 
 
-@pytest.mark.parametrize("module", LATER_MODULES)
-def test_what_is_called_not_built_yet_is_not(module):
-    parent, _, _ = module.rpartition(".")
-    exists = importlib.util.find_spec(parent) and importlib.util.find_spec(module)
-    assert not exists, f"{module} is there now; take it off LATER_MODULES"
-
-
-@pytest.mark.parametrize("entry", TODAY, ids=lambda entry: entry.path)
+@pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry.path)
 def test_a_name_is_as_the_interface_has_it(entry):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)
         found = set(problems(entry))
-    expected = LATER.get(entry.path, set()) | DEVIATIONS.get(entry.path, set())
+    expected = DEVIATIONS.get(entry.path, set())
     assert found == expected
 
 

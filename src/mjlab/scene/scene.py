@@ -267,9 +267,7 @@ class Scene:
         rays = [sensor for sensor in self._sensors.values() if isinstance(sensor, RayCastSensor)]
         cameras = [sensor for sensor in self._sensors.values() if isinstance(sensor, CameraSensor)]
         if rays or cameras:
-            self._sensor_context = SensorContext(
-                mj_model, model, data, cameras, rays, self._device
-            )
+            self._sensor_context = SensorContext(mj_model, model, data, cameras, rays, self._device)
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Reset targets, delays, histories and sensors of environments; None means all."""
