@@ -9,6 +9,11 @@ from typing import Any, Literal
 from mjlab.compat import accepts_older_fields
 
 
+def gaussian_distribution(init_std: float = 1.0) -> dict[str, Any]:
+    """Return a `distribution_cfg`: normal, with one learned deviation for each action."""
+    return {"class_name": "GaussianDistribution", "init_std": init_std, "std_type": "scalar"}
+
+
 @accepts_older_fields
 @dataclass
 class RslRlModelCfg:
@@ -166,13 +171,7 @@ class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
     class_name: str = "OnPolicyRunner"
     """The runner, by rsl_rl's name."""
     actor: RslRlModelCfg = field(
-        default_factory=lambda: RslRlModelCfg(
-            distribution_cfg={
-                "class_name": "GaussianDistribution",
-                "init_std": 1.0,
-                "std_type": "scalar",
-            }
-        )
+        default_factory=lambda: RslRlModelCfg(distribution_cfg=gaussian_distribution())
     )
     """The policy network."""
     critic: RslRlModelCfg = field(default_factory=RslRlModelCfg)

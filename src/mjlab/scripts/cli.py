@@ -129,6 +129,24 @@ def tell(message: str) -> None:
     print(message, file=sys.stderr, flush=True)
 
 
+def first_and_flags(
+    argv: list[str], usage: str, what: str, may_ask_help: list[str]
+) -> tuple[str, list[str]]:
+    """Split the command line into `what` comes first, and the flags.
+
+    Without arguments, or with `--help` among `may_ask_help`, prints `usage` and exits.
+
+    Raises:
+        UserError: flags before it.
+    """
+    if not argv or {"-h", "--help"} & set(may_ask_help):
+        print(usage)
+        sys.exit(0)
+    if argv[0].startswith("-"):
+        raise UserError(f"The {what} comes first, before {argv[0]!r}.\n\n{usage}")
+    return argv[0], argv[1:]
+
+
 def task_and_flags(argv: list[str], usage: str) -> tuple[str, list[str]]:
     """Split the command line into the task's name, which comes first, and its flags.
 
@@ -138,15 +156,11 @@ def task_and_flags(argv: list[str], usage: str) -> tuple[str, list[str]]:
         UnknownTaskError: no such task; the message lists the nearest names.
         UserError: flags before the task.
     """
-    if not argv or argv[0] in ("-h", "--help"):
-        print(usage)
-        sys.exit(0)
-    if argv[0].startswith("-"):
-        raise UserError(f"The task's name comes first, before {argv[0]!r}.\n\n{usage}")
+    task, flags = first_and_flags(argv, usage, "task's name", argv[:1])
     from mjlab.tasks.registry import require_task
 
-    require_task(argv[0])
-    return argv[0], argv[1:]
+    require_task(task)
+    return task, flags
 
 
 def parse_flags(config_type: type[C], default: C, flags: list[str], prog: str) -> C:

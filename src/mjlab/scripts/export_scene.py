@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING, Any
 
-from mjlab.scripts.cli import UserError, parse_flags, run_command
+from mjlab.scripts.cli import first_and_flags, parse_flags, run_command
 
 if TYPE_CHECKING:
     from mjlab.scripts.export_scene_run import ExportSceneConfig as ExportSceneConfig
@@ -37,15 +36,11 @@ def __getattr__(name: str) -> Any:
 
 
 def _command(argv: list[str]) -> None:
-    if not argv or {"-h", "--help"} & set(argv):
-        print(_USAGE)
-        sys.exit(0)
-    if argv[0].startswith("-"):
-        raise UserError(f"The target comes first, before {argv[0]!r}.\n\n{_USAGE}")
+    target, flags = first_and_flags(argv, _USAGE, "target", argv)
     from mjlab.scripts.export_scene_run import ExportSceneConfig, run_export_scene
 
-    flags = parse_flags(ExportSceneConfig, ExportSceneConfig(), argv[1:], "export-scene TARGET")
-    run_export_scene(argv[0], flags)
+    cfg = parse_flags(ExportSceneConfig, ExportSceneConfig(), flags, "export-scene TARGET")
+    run_export_scene(target, cfg)
 
 
 def main() -> None:

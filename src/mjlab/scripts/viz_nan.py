@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING, Any
 
-from mjlab.scripts.cli import UserError, parse_flags, run_command
+from mjlab.scripts.cli import first_and_flags, parse_flags, run_command
 
 if TYPE_CHECKING:
     from mjlab.scripts.viz_nan_run import VizNanConfig as VizNanConfig
@@ -33,14 +32,10 @@ def __getattr__(name: str) -> Any:
 
 
 def _command(argv: list[str]) -> None:
-    if not argv or {"-h", "--help"} & set(argv):
-        print(_USAGE)
-        sys.exit(0)
-    if argv[0].startswith("-"):
-        raise UserError(f"The dump comes first, before {argv[0]!r}.\n\n{_USAGE}")
+    dump, flags = first_and_flags(argv, _USAGE, "dump", argv)
     from mjlab.scripts.viz_nan_run import VizNanConfig, run_viz_nan
 
-    run_viz_nan(argv[0], parse_flags(VizNanConfig, VizNanConfig(), argv[1:], "viz-nan DUMP"))
+    run_viz_nan(dump, parse_flags(VizNanConfig, VizNanConfig(), flags, "viz-nan DUMP"))
 
 
 def main() -> None:

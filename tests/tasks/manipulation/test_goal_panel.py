@@ -2,63 +2,10 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 from lifting_stand_ins import ORIGIN_STEP, lifting_command
-
-
-class Widget:
-    """A slider, check box or handle of a page."""
-
-    def __init__(self, value=None, low=None, high=None):
-        self.value, self.min, self.max = value, low, high
-        self.position = (0.0, 0.0, 0.0)
-        self.callbacks = []
-
-    def on_update(self, callback):
-        self.callbacks.append(callback)
-        return callback
-
-    def by_person(self, **values) -> None:
-        """Do what a person in a browser does."""
-        for name, value in values.items():
-            setattr(self, name, value)
-        for callback in self.callbacks:
-            callback(SimpleNamespace(client=object(), target=self))
-
-
-class Page:
-    """A page that keeps its widgets by label."""
-
-    def __init__(self):
-        self.gui = self.scene = self
-        self.widgets = {}
-
-    def add_folder(self, name):
-        self.widgets[name] = None
-        return self
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        pass
-
-    def add_checkbox(self, label, value, hint=""):
-        return self._add(label, Widget(value))
-
-    def add_slider(self, label, low, high, step, value):
-        assert low <= value <= high
-        return self._add(label, Widget(value, low, high))
-
-    def add_transform_controls(self, name, **_):
-        return self._add(name, Widget())
-
-    def _add(self, label, widget):
-        self.widgets[label] = widget
-        return widget
+from page import Page, Widget
 
 
 class Play:

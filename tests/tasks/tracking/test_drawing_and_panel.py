@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from page import Page
 from tracking_tasks import task_cfg, unperturbed
 
 from mjlab.asset_zoo.robots import get_go1_robot_cfg
@@ -29,61 +30,6 @@ class Board:
 
     def add_frame(self, position, rotation, scale, axis_radius, axis_colors):
         self.frames.append((np.asarray(position), scale, axis_colors))
-
-
-class Widget:
-    """A control of a page."""
-
-    def __init__(self, value=None, **options):
-        self.value, self.options, self.callbacks = value, options, []
-        self.disabled, self.max = options.get("disabled", False), options.get("max")
-        self.content = ""
-
-    def on_update(self, callback):
-        self.callbacks.append(callback)
-        return callback
-
-    on_click = on_update
-
-    def set_by_person(self, value=None) -> None:
-        self.value = value
-        for callback in self.callbacks:
-            callback(SimpleNamespace(client=object()))
-
-
-class Page:
-    """A page that keeps its controls by label."""
-
-    def __init__(self):
-        self.gui, self.widgets = self, {}
-
-    def add_folder(self, name, **_):
-        return self
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        pass
-
-    def _add(self, label, *args, **kwargs):
-        self.widgets[label] = Widget(*args, **kwargs)
-        return self.widgets[label]
-
-    def add_slider(self, label, low, high, step, value, **kwargs):
-        return self._add(label, value, max=high, **kwargs)
-
-    def add_dropdown(self, label, options, *, initial_value, **kwargs):
-        return self._add(label, initial_value, **kwargs)
-
-    def add_checkbox(self, label, value, **kwargs):
-        return self._add(label, value, **kwargs)
-
-    def add_button(self, label, **kwargs):
-        return self._add(label, **kwargs)
-
-    def add_markdown(self, content):
-        return self._add("table")
 
 
 @pytest.fixture

@@ -3,42 +3,24 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from velocity_tasks import GO1_FLAT, task_cfg
+from built_envs import EnvFactory, built_envs
+from velocity_tasks import task_cfg
 
-from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
-
-EnvFactory = Callable[..., ManagerBasedRlEnv]
+from mjlab.envs import ManagerBasedRlEnv
 
 
 @pytest.fixture
 def make_env() -> Iterator[EnvFactory]:
-    """Build environments, after an edit of their config, and close them in the end."""
-    built: list[ManagerBasedRlEnv] = []
-
-    def make(
-        task: str = GO1_FLAT,
-        edit: Callable[[ManagerBasedRlEnvCfg], None] | None = None,
-        **kwargs: Any,
-    ) -> ManagerBasedRlEnv:
-        cfg = task_cfg(task, **kwargs)
-        if edit is not None:
-            edit(cfg)
-        env = ManagerBasedRlEnv(cfg, device="cpu")
-        built.append(env)
-        return env
-
-    yield make
-    for env in built:
-        env.close()
+    """Build environments; arguments are those of `task_cfg`, and `edit`, which edits its config."""
+    yield from built_envs(task_cfg)
 
 
 @pytest.fixture(scope="module")

@@ -2,67 +2,14 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 import torch
+from page import Page
 
 from mjlab.tasks.velocity.mdp import UniformVelocityCommandCfg
 from mjlab.tasks.velocity.mdp.velocity_joystick import VelocityJoystick
 
 RANGES = UniformVelocityCommandCfg.Ranges((-1.5, 2.0), (-1.0, 1.0), (0.0, 0.0))
-
-
-class Widget:
-    """A slider, check box or button of a page."""
-
-    def __init__(self, value=None, low=None, high=None):
-        self.value, self.min, self.max = value, low, high
-        self.callbacks = []
-
-    def on_update(self, callback):
-        self.callbacks.append(callback)
-        return callback
-
-    on_click = on_update
-
-    def set_by_person(self, value=None) -> None:
-        """Do what a person in a browser does."""
-        self.value = value
-        for callback in self.callbacks:
-            callback(SimpleNamespace(client=object(), target=self))
-
-
-class Page:
-    """A page that keeps its widgets by label."""
-
-    def __init__(self):
-        self.gui = self
-        self.widgets = {}
-
-    def add_folder(self, name):
-        self.widgets[name] = None
-        return self
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        pass
-
-    def add_checkbox(self, label, value, hint=""):
-        return self._add(label, Widget(value))
-
-    def add_slider(self, label, low, high, step, value):
-        assert low <= value <= high
-        return self._add(label, Widget(value, low, high))
-
-    def add_button(self, label):
-        return self._add(label, Widget())
-
-    def _add(self, label, widget):
-        self.widgets[label] = widget
-        return widget
 
 
 @pytest.fixture

@@ -7,18 +7,14 @@ and the networks are small enough for their update not to take longer than the p
 from __future__ import annotations
 
 from mjlab.envs import ManagerBasedRlEnvCfg
-from mjlab.rl.config import RslRlOnPolicyRunnerCfg
+from mjlab.rl.config import RslRlOnPolicyRunnerCfg, gaussian_distribution
 
 
 def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     """Edit the configs of a tracking task in place."""
     env_cfg.scene.num_envs = 512
     rl_cfg.actor.hidden_dims = rl_cfg.critic.hidden_dims = (256, 128)
-    rl_cfg.actor.distribution_cfg = {
-        "class_name": "GaussianDistribution",
-        "init_std": 0.5,
-        "std_type": "scalar",
-    }
+    rl_cfg.actor.distribution_cfg = gaussian_distribution(0.5)
     rl_cfg.algorithm.entropy_coef = 0.002
     rl_cfg.algorithm.desired_kl = 0.02
     rl_cfg.algorithm.num_learning_epochs = 4

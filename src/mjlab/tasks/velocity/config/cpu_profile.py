@@ -23,7 +23,7 @@ import torch
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.envs import mdp as envs_mdp
 from mjlab.managers.curriculum_manager import CurriculumTermCfg
-from mjlab.rl.config import RslRlOnPolicyRunnerCfg
+from mjlab.rl.config import RslRlOnPolicyRunnerCfg, gaussian_distribution
 
 _AIR_TIME, _PUSH, _EASED_PUSH = "air_time", "push_robot", "eased_push_robot"
 _NUM_ENVS = 512
@@ -157,11 +157,7 @@ def _undoing(env_cfg: ManagerBasedRlEnvCfg) -> Callable[[ManagerBasedRlEnvCfg], 
 
 def _learn_from_few_samples(rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     rl_cfg.actor.hidden_dims = rl_cfg.critic.hidden_dims = (128, 64)
-    rl_cfg.actor.distribution_cfg = {
-        "class_name": "GaussianDistribution",
-        "init_std": 0.8,
-        "std_type": "scalar",
-    }
+    rl_cfg.actor.distribution_cfg = gaussian_distribution(0.8)
     rl_cfg.algorithm.entropy_coef = 0.01
     rl_cfg.algorithm.desired_kl = 0.03
     rl_cfg.algorithm.gamma = 0.97

@@ -7,6 +7,7 @@ from mjlab.rl.config import (
     RslRlModelCfg,
     RslRlOnPolicyRunnerCfg,
     RslRlPpoAlgorithmCfg,
+    gaussian_distribution,
 )
 from mjlab.tasks.velocity.tracking_errors import TRACKING_ERRORS
 
@@ -17,11 +18,7 @@ def velocity_ppo_runner_cfg(experiment_name: str, max_iterations: int) -> RslRlO
         actor=RslRlModelCfg(
             hidden_dims=(512, 256, 128),
             obs_normalization=True,
-            distribution_cfg={
-                "class_name": "GaussianDistribution",
-                "init_std": 1.0,
-                "std_type": "scalar",
-            },
+            distribution_cfg=gaussian_distribution(),
         ),
         critic=RslRlModelCfg(hidden_dims=(512, 256, 128), obs_normalization=True),
         algorithm=RslRlPpoAlgorithmCfg(entropy_coef=0.01),

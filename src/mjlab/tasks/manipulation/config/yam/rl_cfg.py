@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from mjlab.rl.config import EvaluationCfg, RslRlModelCfg, RslRlOnPolicyRunnerCfg
+from mjlab.rl.config import (
+    EvaluationCfg,
+    RslRlModelCfg,
+    RslRlOnPolicyRunnerCfg,
+    gaussian_distribution,
+)
 from mjlab.tasks.manipulation.success import PLACEMENT, placed_at_goal
 
-_GAUSSIAN: dict[str, Any] = {
-    "class_name": "GaussianDistribution",
-    "init_std": 1.0,
-    "std_type": "scalar",
-}
 _CNN: dict[str, Any] = {
     "output_channels": [16, 32],
     "kernel_size": [5, 3],
@@ -30,7 +30,7 @@ def yam_lift_cube_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
     sizes = (512, 256, 128)
     return RslRlOnPolicyRunnerCfg(
         actor=RslRlModelCfg(
-            hidden_dims=sizes, obs_normalization=True, distribution_cfg=dict(_GAUSSIAN)
+            hidden_dims=sizes, obs_normalization=True, distribution_cfg=gaussian_distribution()
         ),
         critic=RslRlModelCfg(hidden_dims=sizes, obs_normalization=True),
         experiment_name="yam_lift_cube",
@@ -63,7 +63,7 @@ def _vision(experiment_name: str) -> RslRlOnPolicyRunnerCfg:
         )
 
     return RslRlOnPolicyRunnerCfg(
-        actor=model(dict(_GAUSSIAN)),
+        actor=model(gaussian_distribution()),
         critic=model(None),
         obs_groups={"actor": ("actor", "camera"), "critic": ("critic", "camera")},
         experiment_name=experiment_name,

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from mjlab.rl.config import EvaluationCfg, RslRlModelCfg, RslRlOnPolicyRunnerCfg
+from mjlab.rl.config import (
+    EvaluationCfg,
+    RslRlModelCfg,
+    RslRlOnPolicyRunnerCfg,
+    gaussian_distribution,
+)
 from mjlab.tasks.tracking.evaluation import TRACKING_ERRORS, play_motions_once
 
 
@@ -12,11 +17,7 @@ def unitree_g1_tracking_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
         actor=RslRlModelCfg(
             hidden_dims=(512, 256, 128),
             obs_normalization=True,
-            distribution_cfg={
-                "class_name": "GaussianDistribution",
-                "init_std": 1.0,
-                "std_type": "scalar",
-            },
+            distribution_cfg=gaussian_distribution(),
         ),
         critic=RslRlModelCfg(hidden_dims=(512, 256, 128), obs_normalization=True),
         experiment_name="g1_tracking",
