@@ -12,7 +12,7 @@ import yaml
 from commands import TASK
 
 from mjlab.scripts.evaluate_run import EvaluateConfig
-from mjlab.scripts.policy import policy_env_cfg
+from mjlab.scripts.policy import env_cfg_of, parse_policy_flags, policy_env_cfg
 from mjlab.scripts.profiles import suggest_profile
 from mjlab.scripts.run_folder import read_run_info, write_run_info
 from mjlab.scripts.train_run import TrainConfig, parse_train_flags
@@ -100,6 +100,9 @@ def test_policies_are_shown_as_evaluations_have_it_and_not_as_the_profile_trains
         parse_train_flags("Test-Easier", ["--profile", "cpu"], "train").env.episode_length_s == 5.0
     )
     assert policy_env_cfg("Test-Easier", "cpu", play=False).episode_length_s == 0.1
+    flags = ["--profile", "cpu", "--env.episode-length-s", "0.3"]
+    cfg = parse_policy_flags(EvaluateConfig, flags, "Test-Easier", "evaluate", play=False)
+    assert env_cfg_of("Test-Easier", cfg, None, play=False).episode_length_s == 0.3
 
 
 @pytest.mark.parametrize("script", ["train", "play", "evaluate", "train_seeds"])

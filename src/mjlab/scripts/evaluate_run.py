@@ -45,9 +45,6 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
     checkpoint = find_checkpoint(task, cfg)
     env_cfg = env_cfg_of(task, cfg, checkpoint, play=False)
     solved = load_rl_cfg(task, profile=cfg.profile).evaluation
-    if solved.prepare_env is not None:
-        # Once more: what it does may depend on what the task has got for this policy.
-        solved.prepare_env(env_cfg)
     env = make_env(
         task,
         env_cfg,

@@ -270,13 +270,14 @@ def policy_env_cfg(task: str, profile: str | None, *, play: bool) -> ManagerBase
     """Return the environment config that shows what a policy trained under `profile` can do.
 
     It has as many environments as the task has without the profile: how many of them learning takes
-    says nothing about how many to look at. What the profile makes easier for learning is as hard as
-    in evaluations.
+    says nothing about how many to look at. To score a policy it is the config of evaluations in
+    training; to `play` one too, under a profile, since what the profile makes easier for learning is
+    to be shown as hard as it is.
     """
     cfg = load_env_cfg(task, play=play, profile=profile)
     if profile is not None:
         cfg.scene.num_envs = load_env_cfg(task, play=play).scene.num_envs
-        prepare = load_rl_cfg(task, profile=profile).evaluation.prepare_env
-        if prepare is not None:
-            prepare(cfg)
+    prepare = load_rl_cfg(task, profile=profile).evaluation.prepare_env
+    if prepare is not None and (profile is not None or not play):
+        prepare(cfg)
     return cfg

@@ -71,7 +71,7 @@ def test_a_motion_longer_than_an_episode_is_played_to_its_end(tmp_path, short):
     cfg = task_cfg("squat")
     cfg.episode_length_s = 2.0
     play_motions_once(cfg)
-    assert cfg.episode_length_s == pytest.approx(221 * 0.02)
+    assert cfg.episode_length_s > 221 * 0.02
     assert "push_robot" not in cfg.events
     assert cfg.commands["motion"].sampling_mode == "start"
     # Noise, randomization and perturbed starts stay.

@@ -16,12 +16,11 @@ from mjlab.managers import TerminationTermCfg
 from mjlab.tasks.tracking.mdp import metrics
 from mjlab.tasks.tracking.mdp.motion_command import MotionCommand, MotionCommandCfg
 from mjlab.tasks.tracking.mdp.terminations import motion_ended
-from mjlab.tasks.tracking.motion_file import read_motion
-from mjlab.tasks.tracking.motion_sources import find_motions
 
 _COMMAND = "motion"
 _END_EFFECTORS = "ee_body_pos"
 _END = "motion_ended"
+_LONGER_THAN_MOTIONS_S = 3600.0
 
 
 def mpkpe(env: Any) -> torch.Tensor:
@@ -71,10 +70,8 @@ def play_motions_once(cfg: Any) -> None:
     cfg.terminations[_END] = TerminationTermCfg(
         func=motion_ended, time_out=True, params={"command_name": _COMMAND}
     )
-    # The motion is to end the episode, and not the clock.
-    longest = max(read_motion(path).num_frames for path in find_motions(motion.motion_file))
-    step_dt = cfg.decimation * cfg.sim.mujoco.timestep
-    cfg.episode_length_s = max(cfg.episode_length_s, longest * step_dt)
+    # The motion is to end the episode, and not the clock. Which motion it will be is not known yet.
+    cfg.episode_length_s = max(cfg.episode_length_s, _LONGER_THAN_MOTIONS_S)
 
 
 def _command(env: Any) -> MotionCommand:
