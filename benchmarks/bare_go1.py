@@ -194,6 +194,8 @@ def profile_cfg() -> tuple[dict[str, Any], int]:
         for unused in ("cnn_cfg", "rnn_type", "rnn_hidden_dim", "rnn_num_layers"):
             cfg[model].pop(unused)
     cfg["critic"].pop("distribution_cfg")
+    # Mirror images are made of the task's observation terms.
+    cfg["algorithm"]["symmetry_cfg"] = None
     return cfg, load_env_cfg(task, profile="cpu").scene.num_envs
 
 

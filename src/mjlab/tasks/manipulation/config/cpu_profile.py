@@ -27,12 +27,14 @@ def cpu_vision(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) ->
 
 
 def _learn_from_small_batches(rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
-    rl_cfg.algorithm.num_learning_epochs = 4
-    rl_cfg.algorithm.desired_kl = 0.02
-    rl_cfg.num_steps_per_env = 24
-    rl_cfg.max_iterations = 3000
-    rl_cfg.save_interval = 100
+    rl_cfg.algorithm.entropy_coef = 0.01
+    rl_cfg.algorithm.desired_kl = 0.03
+    rl_cfg.algorithm.gamma = 0.97
+    rl_cfg.num_steps_per_env = 12
+    rl_cfg.max_iterations = 6000
+    rl_cfg.save_interval = 200
     evaluation = rl_cfg.evaluation
     evaluation.num_episodes = 256
-    evaluation.min_interval = 100
+    evaluation.trigger_return = 2000.0
+    evaluation.min_interval = 150
     evaluation.solved_above = {"success_rate": 0.9}

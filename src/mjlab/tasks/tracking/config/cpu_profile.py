@@ -15,14 +15,14 @@ def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     env_cfg.scene.num_envs = 512
     rl_cfg.actor.hidden_dims = rl_cfg.critic.hidden_dims = (256, 128)
     rl_cfg.actor.distribution_cfg = gaussian_distribution(0.5)
-    rl_cfg.algorithm.entropy_coef = 0.002
-    rl_cfg.algorithm.desired_kl = 0.02
-    rl_cfg.algorithm.num_learning_epochs = 4
-    rl_cfg.num_steps_per_env = 16
-    rl_cfg.max_iterations = 3000
-    rl_cfg.save_interval = 100
+    rl_cfg.algorithm.entropy_coef = 0.005
+    rl_cfg.algorithm.desired_kl = 0.03
+    rl_cfg.algorithm.gamma = 0.97
+    rl_cfg.num_steps_per_env = 12
+    rl_cfg.max_iterations = 6000
+    rl_cfg.save_interval = 200
     evaluation = rl_cfg.evaluation
     evaluation.num_episodes = 200
-    evaluation.min_interval = 100
+    evaluation.min_interval = 300
     evaluation.solved_below = {"r_mpkpe": 0.05}
     evaluation.solved_above = {"success_rate": 0.9}

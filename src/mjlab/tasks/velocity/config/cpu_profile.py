@@ -4,10 +4,13 @@ A few cores step some ten thousand environments a second, a hundredth of a GPU. 
 settings a robot has not left its first idea by then, which is to stand still: trying to move costs
 more penalty than it earns. So the profile makes the task easier to learn, not easier to pass:
 
-- Penalties start at a fraction of their weight and grow to it, and so do pushes; a reward for feet in
-  the air, which the task has but does not weigh, fades out meanwhile.
+- Penalties start at a fraction of their weight and grow to it, those that lift the feet sooner than
+  the others, and so do pushes; a reward for feet in the air, which the task has but does not weigh,
+  fades out meanwhile.
 - Contacts have no rolling and torsional friction, and a pyramidal friction cone. The solver then
   takes half the time.
+- The mirror image of each sample is one more sample. Without it, a policy walks as soon, and stumbles
+  far longer in the directions that it has seen least.
 - Batches and networks are small, a policy may change more in an iteration, and rewards far away count
   less: what a leg does shows within a second.
 
@@ -30,6 +33,9 @@ _NUM_ENVS = 512
 _PENALTY_AT_FIRST = 0.02
 _AIR_TIME_AT_FIRST = 0.5
 _EASED_SAMPLES = 6_000_000
+# Whoever drags the feet falls at each change of command.
+_LIFTING = ("foot_clearance", "foot_swing_height")
+_LIFTING_EASED_SAMPLES = 2_000_000
 _UNPUSHED_SAMPLES = 2_000_000
 _NUM_STAGES = 60
 
@@ -45,7 +51,7 @@ def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     evaluation = rl_cfg.evaluation
     evaluation.num_episodes = 200
     evaluation.trigger_return = 3600.0
-    evaluation.min_interval = 25
+    evaluation.min_interval = 40
     evaluation.solved_below = {"lin_vel_error": 0.25, "ang_vel_error": 0.35, "failure_rate": 0.05}
 
 
@@ -59,10 +65,10 @@ def cpu_humanoid(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) 
     # More joints need less noise each for a body to be thrown about as much.
     rl_cfg.algorithm.entropy_coef = 0.005
     rl_cfg.actor.hidden_dims = rl_cfg.critic.hidden_dims = (256, 128)
-    rl_cfg.max_iterations = 3000
+    rl_cfg.max_iterations = 6000
     evaluation = rl_cfg.evaluation
     evaluation.trigger_return = 2500.0
-    evaluation.min_interval = 50
+    evaluation.min_interval = 100
     evaluation.solved_below = {"lin_vel_error": 0.4, "failure_rate": 0.2}
 
 
@@ -87,7 +93,7 @@ def _ease_rewards(env_cfg: ManagerBasedRlEnvCfg) -> None:
 
 def _change_weight(env_cfg: ManagerBasedRlEnvCfg, name: str, first: float, last: float) -> None:
     """Let the weight of a reward go from `first` to `last`, a little at a time."""
-    steps = _EASED_SAMPLES // _NUM_ENVS
+    steps = (_LIFTING_EASED_SAMPLES if name in _LIFTING else _EASED_SAMPLES) // _NUM_ENVS
     stages = [
         {
             "step": stage * steps // _NUM_STAGES,
@@ -161,6 +167,10 @@ def _learn_from_few_samples(rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     rl_cfg.algorithm.entropy_coef = 0.01
     rl_cfg.algorithm.desired_kl = 0.03
     rl_cfg.algorithm.gamma = 0.97
-    rl_cfg.num_steps_per_env = 24
-    rl_cfg.max_iterations = 1000
-    rl_cfg.save_interval = 50
+    rl_cfg.algorithm.symmetry_cfg = {
+        "data_augmentation_func": "mjlab.tasks.velocity.symmetry:mirror_left_right",
+        "use_data_augmentation": True,
+    }
+    rl_cfg.num_steps_per_env = 12
+    rl_cfg.max_iterations = 2000
+    rl_cfg.save_interval = 100
