@@ -68,8 +68,8 @@ def measure_case(case: Case) -> Row:
     """Measure one task.
 
     The bare loop steps the same models, those of the environments with what their events have
-    randomized, and in each round starts from the states in which the environments are, with the same
-    controls: what a robot does decides what its physics costs.
+    randomized, and makes each of its steps from the states in which the environments are, with the
+    same controls: what a robot does decides what its physics costs.
     """
     env = make_env(case.task, case.num_envs)
     generator = torch.Generator().manual_seed(0)
@@ -88,7 +88,7 @@ def measure_case(case: Case) -> Row:
         for origins, directions, groups, *_ in recorded_rays(env):
             bare.cast(origins.numpy(), directions.numpy(), tuple(groups or range(6)))
     env_time, bare_time = alternate(
-        bare, lambda: env.step(actions), steps=5, repeats=21, before=same_states
+        bare, lambda: env.step(actions), steps=1, repeats=101, before=same_states
     )[::-1]
     ratio = bare_time / env_time
     rays = ", same rays" if case.with_rays else ""

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import pytest
 import torch
 from tensordict import TensorDict
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import ObservationTermCfg, SceneEntityCfg
-from mjlab.tasks.registry import load_env_cfg
+from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.tasks.velocity.symmetry import mirror_left_right
 
 FLAT_GO1 = "Mjlab-Velocity-Flat-Unitree-Go1"
@@ -140,4 +143,22 @@ def test_what_has_no_known_mirror_image_is_refused(edit, message):
     env = make_env(FLAT_GO1, edit)
     with pytest.raises(ValueError, match=message):
         mirror_left_right(env, actions=torch.zeros(2, 12))
+    env.close()
+
+
+def test_the_cpu_profile_learns_from_mirror_images(tmp_path):
+    cfg, rl_cfg = load_env_cfg(FLAT_GO1, profile="cpu"), load_rl_cfg(FLAT_GO1, profile="cpu")
+    cfg.scene.num_envs = 8
+    env = RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg, device="cpu"))
+    runner = MjlabOnPolicyRunner(env, asdict(rl_cfg), str(tmp_path), "cpu")
+    sizes = []
+    runner.alg.actor.register_forward_pre_hook(
+        lambda module, args: sizes.append(args[0].batch_size[0])
+    )
+    runner.learn(1)
+    # A mini-batch is a quarter of 8 environments times 12 steps, and its mirror image.
+    assert max(sizes) == 2 * 8 * 12 // 4
+    path = tmp_path / "symmetric.pt"
+    runner.save(str(path))
+    runner.load(str(path))
     env.close()
