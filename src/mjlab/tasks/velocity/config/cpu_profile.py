@@ -27,6 +27,9 @@ from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.envs import mdp as envs_mdp
 from mjlab.managers.curriculum_manager import CurriculumTermCfg
 from mjlab.rl.config import RslRlOnPolicyRunnerCfg, gaussian_distribution
+from mjlab.tasks.simple_contacts import simplify_contacts
+
+_Edit = Callable[[ManagerBasedRlEnvCfg], None]
 
 _AIR_TIME, _PUSH, _EASED_PUSH = "air_time", "push_robot", "eased_push_robot"
 _NUM_ENVS = 512
@@ -43,8 +46,8 @@ _NUM_STAGES = 60
 def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     """Edit the configs of a velocity task in place."""
     env_cfg.scene.num_envs = _NUM_ENVS
-    rl_cfg.evaluation.prepare_env = _undoing(env_cfg)
-    _simplify_contacts(env_cfg)
+    undo_contacts = simplify_contacts(env_cfg)
+    rl_cfg.evaluation.prepare_env = _undoing(env_cfg, undo_contacts)
     _ease_rewards(env_cfg)
     _ease_pushes(env_cfg)
     _learn_from_few_samples(rl_cfg)
@@ -70,13 +73,6 @@ def cpu_humanoid(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) 
     evaluation.trigger_return = 2500.0
     evaluation.min_interval = 100
     evaluation.solved_below = {"lin_vel_error": 0.4, "failure_rate": 0.2}
-
-
-def _simplify_contacts(env_cfg: ManagerBasedRlEnvCfg) -> None:
-    env_cfg.sim.mujoco.cone = "pyramidal"
-    for collision in env_cfg.scene.entities["robot"].collisions:
-        if isinstance(collision.condim, dict):
-            collision.condim = {name: min(dim, 3) for name, dim in collision.condim.items()}
 
 
 def _eased_weights(env_cfg: ManagerBasedRlEnvCfg) -> dict[str, float]:
@@ -140,16 +136,12 @@ def growing_pushes(
     return fraction
 
 
-def _undoing(env_cfg: ManagerBasedRlEnvCfg) -> Callable[[ManagerBasedRlEnvCfg], None]:
-    """Return what makes an environment config that the profile eased as hard as `env_cfg` is now."""
-    cone = env_cfg.sim.mujoco.cone
-    condim = [collision.condim for collision in env_cfg.scene.entities["robot"].collisions]
+def _undoing(env_cfg: ManagerBasedRlEnvCfg, undo_contacts: _Edit) -> _Edit:
+    """Return what undoes the contacts, and makes rewards and pushes what they are in `env_cfg` now."""
     weights = _eased_weights(env_cfg)
 
     def undo_easing(eased: ManagerBasedRlEnvCfg) -> None:
-        eased.sim.mujoco.cone = cone
-        for collision, dims in zip(eased.scene.entities["robot"].collisions, condim, strict=True):
-            collision.condim = dims
+        undo_contacts(eased)
         for name, weight in weights.items():
             if eased.curriculum.pop(f"eased_{name}", None) is not None:
                 _set_weight(eased, name, weight)

@@ -1,0 +1,34 @@
+"""What a `cpu` profile makes easier for learning, evaluations, `evaluate` and `play` undo."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import pytest
+
+from mjlab.tasks.registry import list_profiles, list_tasks, load_env_cfg, load_rl_cfg
+from mjlab.utils.os import dump_yaml
+
+TASKS = [task for task in list_tasks() if "cpu" in list_profiles(task)]
+
+
+def written(cfg, path):
+    dump_yaml(path, asdict(cfg))
+    return path.read_text()
+
+
+def test_there_are_tasks_with_such_a_profile():
+    assert len(TASKS) >= 10
+
+
+@pytest.mark.parametrize("play", [False, True])
+@pytest.mark.parametrize("task", TASKS)
+def test_evaluations_are_those_of_the_task_without_the_profile(task, play, tmp_path):
+    plain, eased = load_env_cfg(task, play=play), load_env_cfg(task, play=play, profile="cpu")
+    for cfg, profile in ((plain, None), (eased, "cpu")):
+        prepare = load_rl_cfg(task, profile=profile).evaluation.prepare_env
+        if prepare is not None:
+            prepare(cfg)
+    # How many there are makes nothing easier.
+    eased.scene.num_envs = plain.scene.num_envs
+    assert written(eased, tmp_path / "eased.yaml") == written(plain, tmp_path / "plain.yaml")
