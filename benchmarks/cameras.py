@@ -9,13 +9,14 @@ home. All take turns in one run, so that their ratios hold on a machine that oth
 - MuJoCo's own offscreen renderer, an environment after another, where OpenGL is available: the same
   two images, and colours as the model has them, with shadows.
 
-Run alone: `python benchmarks/cameras.py`, with the number of environments if not 512.
+Run alone: `python benchmarks/cameras.py`, with the number of environments if not 512. In software
+OpenGL needs `MUJOCO_GL=osmesa`.
 """
 
 from __future__ import annotations
 
+import functools
 import sys
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -23,6 +24,7 @@ import mjbatch
 import mujoco
 import numpy as np
 import torch
+from report import Row, show
 from timing import alternate
 
 from mjlab.envs import ManagerBasedRlEnv
@@ -34,7 +36,9 @@ from mjlab.viewer.gl_context import open_renderer
 
 TASK, SENSOR, SIZE = "Mjlab-Lift-Cube-Yam-Rgb", "camera_d405", 32
 # Images a second of two cores that are to be reached.
-WANTED = {"depth and segmentation": 4000.0, "colours": 2500.0}
+BOTH, COLOURS = "depth and segmentation", "colours"
+WANTED = {BOTH: 4000.0, COLOURS: 2500.0}
+BARE, RENDERER = "bare `mjbatch.rays`", "MuJoCo's renderer"
 REPEATS = 15
 
 
@@ -75,14 +79,9 @@ class Renderers:
     """MuJoCo's offscreen renderer, of one environment after another."""
 
     def __init__(self, sim: Simulation, camera_id: int) -> None:
-        from OpenGL import GL
-
         self._sim, self._camera_id = sim, camera_id
         self._data = mujoco.MjData(sim.mj_model)
         self._renderer = open_renderer(sim.mj_model, SIZE, SIZE)
-        # A context is current, and can be asked, once something has been drawn.
-        self.colours(1)
-        self.name = (GL.glGetString(GL.GL_RENDERER) or b"unknown").decode()
 
     def _pose(self, env: int) -> None:
         self._sim.copy_to_host(env, self._data)
@@ -120,63 +119,57 @@ def build(num_envs: int) -> ManagerBasedRlEnv:
     return env
 
 
-def cpu_time(sample: Callable[[], Any]) -> float:
-    """Return the least CPU time of all threads, in microseconds, which others disturb less."""
-    times = []
-    for _ in range(REPEATS):
-        begin = time.process_time()
-        sample()
-        times.append(time.process_time() - begin)
-    return 1e6 * min(times)
-
-
-def main() -> None:
-    """Measure, and print one line for each."""
-    num_envs = int(sys.argv[1]) if len(sys.argv) > 1 else 512
+def measure(num_envs: int = 512) -> list[Row]:
+    """Measure both kinds of images, beside bare rays and, where there is OpenGL, the renderer."""
     env = build(num_envs)
     sim, sensor = env.sim, env.scene[SENSOR]
     groups, camera = sensor.view.geom_groups, sensor.camera_idx
-    both, colours = (
-        (CameraView(camera, SIZE, SIZE, types, groups),)
-        for types in (("depth", "segmentation"), ("rgb",))
-    )
-    bare = BareRays(sim, camera, groups)
-    samples: dict[str, tuple[Callable[[], Any], int]] = {
-        "depth and segmentation": (lambda: sim.render(both), num_envs),
-        "colours": (lambda: sim.render(colours), num_envs),
-        "bare mjbatch.rays": (bare, num_envs),
+    views = {
+        name: (CameraView(camera, SIZE, SIZE, types, groups),)
+        for name, types in ((BOTH, ("depth", "segmentation")), (COLOURS, ("rgb",)))
     }
-    try:
-        renderers = Renderers(sim, camera)
-    except RenderingUnavailableError as error:
-        print(f"MuJoCo's renderer is left out: {str(error).splitlines()[0]}")
-    else:
-        print(f"OpenGL: {renderers.name}")
-        samples |= {
-            "renderer: depth and seg.": (lambda: renderers.depth_and_segmentation(8), 8),
-            "renderer: colours": (lambda: renderers.colours(1), 1),
-        }
-    parts = list(samples.values())
-    times = alternate(*(sample for sample, _ in parts), steps=1, repeats=REPEATS, warm_up=2)
+    samples: dict[str, tuple[Callable[[], Any], int]] = {
+        name: (functools.partial(sim.render, view), num_envs) for name, view in views.items()
+    }
+    bare = BareRays(sim, camera, groups)
+    samples[BARE] = (bare, num_envs)
+    samples |= renderer_samples(sim, camera)
+    times = alternate(*(s for s, _ in samples.values()), steps=1, repeats=REPEATS, warm_up=2)
     speeds = {
         name: count / time for (name, (_, count)), time in zip(samples.items(), times, strict=True)
     }
-    ids = sim.render(both)[0].segmentation
-    assert ids is not None
-    same = (ids[..., 0].reshape(num_envs, -1).numpy() == bare.geoms).mean()
-    print(f"{sim.capabilities.description}; {num_envs} environments, {SIZE} x {SIZE} pixels")
-    print(f"pixels that show the geom which bare rays meet: {100 * same:.2f} %")
-    for name, speed in speeds.items():
-        sample, count = samples[name]
-        line = f"{name:26}{speed:9.1f} images/s{cpu_time(sample) / count:10.0f} us of CPU"
-        if name in WANTED:
-            line += f"{speed / speeds['bare mjbatch.rays']:7.1f} x bare rays"
-            for other in ("renderer: depth and seg.", "renderer: colours"):
-                if other in speeds:
-                    line += f"{speed / speeds[other]:9.1f} x {other}"
-            line += f"   (wanted: {WANTED[name]:.0f}/s)"
-        print(line)
+    seen = sim.render(views[BOTH])[0].segmentation
+    assert seen is not None
+    same = (seen[..., 0].reshape(num_envs, -1).numpy() == bare.geoms).mean()
+    env.close()
+    return [row(name, speeds, same) for name in WANTED]
+
+
+def renderer_samples(sim: Simulation, camera: int) -> dict[str, tuple[Callable[[], Any], int]]:
+    """Return what MuJoCo's renderer draws for each kind of images, and of how many environments."""
+    try:
+        renderers = Renderers(sim, camera)
+    except RenderingUnavailableError:
+        return {}
+    return {
+        f"{RENDERER}, {BOTH}": (lambda: renderers.depth_and_segmentation(8), 8),
+        f"{RENDERER}, {COLOURS}": (lambda: renderers.colours(1), 1),
+    }
+
+
+def row(name: str, speeds: dict[str, float], same: float) -> Row:
+    """Return the line of one kind of images; `same` is the share of pixels equal to bare rays'."""
+    beside = {BARE: speeds[BARE]} | {k: v for k, v in speeds.items() if k.startswith(RENDERER)}
+    shown = "; ".join(f"{k}: {v:,.4g}/s ({speeds[name] / v:,.3g} x)" for k, v in beside.items())
+    agreed = f"; {same:.2%} of pixels show what bare rays meet" if name == BOTH else ""
+    return Row(
+        f"cameras, {SIZE} x {SIZE}, lift-cube scene, native: {name}",
+        f"{speeds[name]:,.0f} images/s{agreed}",
+        shown if len(beside) > 1 else f"{shown}; no OpenGL here",
+        f"{WANTED[name]:,.0f} images/s",
+        speeds[name] >= WANTED[name],
+    )
 
 
 if __name__ == "__main__":
-    main()
+    print(show(measure(int(sys.argv[1]) if len(sys.argv) > 1 else 512)))

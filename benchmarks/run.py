@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import cameras
 import learning
+import reach
 import repeatability
 import startup
 import tasks
 import throughput
+import walking
 from report import RESULTS, Row, show, write
 
 
 def main() -> None:
     rows: list[Row] = []
-    for benchmark in (throughput, tasks, startup, repeatability, learning):
+    quick = (throughput, tasks, cameras, reach, startup, repeatability)
+    for benchmark in (*quick, learning, walking):
         print(f"{benchmark.__name__} ...", flush=True)
         rows += benchmark.measure()
         # Written after each, so that a long run that is stopped has left what it measured.

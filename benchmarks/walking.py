@@ -1,10 +1,10 @@
 """How fast Go1 learns to walk on two cores, with the task's `cpu` profile, beside a bare loop.
 
 `uv run --group dev python benchmarks/walking.py [SEED ...]` trains seeds 1 to 3 unless told otherwise,
-and the bare loop of `bare_go1.py` with the first. That takes half an hour, so it is not part of `make
-bench`. Tracking is reached when the evaluation that training makes says so: over 200 episodes of the
-task as it is without the profile, the mean error of linear velocity is under 0.25 m/s, of angular
-velocity under 0.35 rad/s, and under 5 % of the episodes ended in a fall.
+and the bare loop of `bare_go1.py` with the first; `make bench` takes seed 1 only. Tracking is reached
+when the evaluation that training makes says so: over 200 episodes of the task as it is without the
+profile, the mean error of linear velocity is under 0.25 m/s, of angular velocity under 0.35 rad/s, and
+under 5 % of the episodes ended in a fall.
 """
 
 from __future__ import annotations
