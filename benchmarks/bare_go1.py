@@ -2,7 +2,8 @@
 
 Model, control, observations, commands and pushes are those of `Mjlab-Velocity-Flat-Unitree-Go1`, and
 contacts as simple as its `cpu` profile makes them (here also where the policy is evaluated); rewards
-are a few lines written by hand, and PPO is rsl_rl's with the settings of the profile. `python benchmarks/bare_go1.py MINUTES SEED` trains for so long, evaluating as it goes, and
+are a few lines written by hand, and PPO is rsl_rl's with the settings of the profile, but for mirror
+images. `python benchmarks/bare_go1.py MINUTES SEED` trains for so long, evaluating as it goes, and
 prints one line of JSON for each evaluation.
 """
 
@@ -207,7 +208,7 @@ def main() -> None:
     cfg, num_envs = profile_cfg()
     runner = OnPolicyRunner(BareGo1(num_envs), cfg, None, "cpu")
     beside = BareGo1(200)
-    iterations, every = 0, 50
+    iterations, every = 0, 100
     while time.perf_counter() - begin < 60 * minutes:
         runner.learn(every, init_at_random_ep_len=iterations == 0)
         iterations += every

@@ -83,10 +83,13 @@ def measure_case(case: Case) -> Row:
     def same_states() -> None:
         for name, values in bare.state.items():
             values[:] = getattr(env.sim.data, name).numpy()
+        if case.with_rays:
+            bare.cast(
+                (origins.numpy(), directions.numpy(), tuple(groups or range(6)))
+                for origins, directions, groups, *_ in recorded_rays(env)
+            )
 
-    if case.with_rays:
-        for origins, directions, groups, *_ in recorded_rays(env):
-            bare.cast(origins.numpy(), directions.numpy(), tuple(groups or range(6)))
+    same_states()
     env_time, bare_time = alternate(
         bare, lambda: env.step(actions), steps=1, repeats=101, before=same_states
     )[::-1]

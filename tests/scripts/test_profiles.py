@@ -99,10 +99,12 @@ def test_policies_are_shown_as_evaluations_have_it_and_not_as_the_profile_trains
     assert (
         parse_train_flags("Test-Easier", ["--profile", "cpu"], "train").env.episode_length_s == 5.0
     )
-    assert policy_env_cfg("Test-Easier", "cpu", play=False).episode_length_s == 0.1
+    assert policy_env_cfg("Test-Easier", "cpu", purpose="evaluate").episode_length_s == 0.1
+    assert policy_env_cfg("Test-Easier", "cpu", purpose="play").episode_length_s == 0.1
+    assert policy_env_cfg("Test-Easier", "cpu", purpose="train").episode_length_s == 5.0
     flags = ["--profile", "cpu", "--env.episode-length-s", "0.3"]
-    cfg = parse_policy_flags(EvaluateConfig, flags, "Test-Easier", "evaluate", play=False)
-    assert env_cfg_of("Test-Easier", cfg, None, play=False).episode_length_s == 0.3
+    cfg = parse_policy_flags(EvaluateConfig, flags, "Test-Easier", "evaluate", purpose="evaluate")
+    assert env_cfg_of("Test-Easier", cfg, None, purpose="evaluate").episode_length_s == 0.3
 
 
 @pytest.mark.parametrize("script", ["train", "play", "evaluate", "train_seeds"])

@@ -57,7 +57,7 @@ def test_the_options_of_a_task_are_flags_of_every_command():
     assert (options_of(TASK, cfg).pole_colour, cfg.num_envs) == ("blue", 3)
     for kind in (PlayConfig, EvaluateConfig):
         found = parse_policy_flags(
-            kind, ["--agent", "zero", "--pole-colour=green"], TASK, "command", play=True
+            kind, ["--agent", "zero", "--pole-colour=green"], TASK, "command", purpose="play"
         )
         assert isinstance(found, kind)
         assert options_of(TASK, found).pole_colour == "green"
@@ -90,14 +90,14 @@ def test_flags_of_a_task_are_in_its_help(capsys):
 def test_a_task_prepares_a_copy_of_its_config_before_it_is_built(tmp_path):
     checkpoint = tmp_path / "model_3.pt"
     flags = ["--agent", "zero", "--pole-colour", "blue", "--wandb-run-path", "org/p/run"]
-    cfg = parse_policy_flags(PlayConfig, flags, TASK, "play", play=True)
-    env_cfg = env_cfg_of(TASK, cfg, checkpoint, play=True)
+    cfg = parse_policy_flags(PlayConfig, flags, TASK, "play", purpose="play")
+    env_cfg = env_cfg_of(TASK, cfg, checkpoint, purpose="play")
     assert env_cfg.prepared == ("blue", PolicyOrigin(TASK, checkpoint, "org/p/run"))
     assert not hasattr(cfg.env, "prepared")
     # A file on disk is of no run at Weights & Biases.
     cfg.checkpoint_file = str(checkpoint)
-    assert env_cfg_of(TASK, cfg, checkpoint, play=True).prepared[1].wandb_run_path is None
-    assert env_cfg_of(TASK, cfg, None, play=True).prepared[1] == PolicyOrigin(TASK)
+    assert env_cfg_of(TASK, cfg, checkpoint, purpose="play").prepared[1].wandb_run_path is None
+    assert env_cfg_of(TASK, cfg, None, purpose="play").prepared[1] == PolicyOrigin(TASK)
 
 
 def test_a_task_without_options_prepares_nothing():

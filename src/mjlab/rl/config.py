@@ -124,7 +124,9 @@ class EvaluationCfg:
     together with another condition of success."""
     prepare_env: Callable[[Any], None] | None = None
     """Turns, in place, a copy of the training environments' config into that of evaluations, where
-    training makes the task easier than it is. None: they are the same."""
+    training makes the task easier than it is. None: they are the same. Evaluations in training call
+    it on the config that the run has got; `evaluate` before flags and `TaskOptions` change anything,
+    so that they win."""
 
 
 @dataclass

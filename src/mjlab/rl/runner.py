@@ -45,6 +45,7 @@ from mjlab.rl.rsl import (
 from mjlab.rl.run_logger import RunLogger
 from mjlab.rl.solved import SolvedCheck
 from mjlab.rl.stop_request import StopRequest
+from mjlab.rl.symmetry_check import check_symmetry
 from mjlab.rl.threads import torch_threads, using_torch_threads
 from mjlab.utils.processes import process_rank
 from mjlab.utils.random import seed_rng
@@ -89,12 +90,14 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             device: Device of the networks.
 
         Raises:
-            ValueError: a network cannot take the observations that `obs_groups` gives it.
+            ValueError: a network cannot take the observations that `obs_groups` gives it, or
+                `symmetry_cfg` has no function that makes mirror images.
         """
         _drop_unused_keys(train_cfg)
         observations = env.get_observations()
         check_networks(observations, train_cfg)
         settle_image_settings(observations, train_cfg)
+        check_symmetry(env, observations, train_cfg)
         if train_cfg.get("torch_compile_mode"):
             enable_torch_compile()
         with _printing_to_log(), shared_parameters_allowed():

@@ -32,7 +32,7 @@ def demo_cfg() -> PlayConfig:
     from mjlab.scripts.policy import policy_env_cfg
     from mjlab.sensor import RayCastSensorCfg
 
-    env = policy_env_cfg(TASK, None, play=True)
+    env = policy_env_cfg(TASK, None, purpose="play")
     for sensor in env.scene.sensors:
         # A first look is at the robot, not at what its sensors see.
         if isinstance(sensor, RayCastSensorCfg):

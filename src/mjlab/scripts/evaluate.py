@@ -33,7 +33,9 @@ def _command(argv: list[str]) -> None:
     from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
     from mjlab.scripts.policy import parse_policy_flags
 
-    run_evaluate(task, parse_policy_flags(EvaluateConfig, flags, task, "evaluate", play=False))
+    run_evaluate(
+        task, parse_policy_flags(EvaluateConfig, flags, task, "evaluate", purpose="evaluate")
+    )
 
 
 def main() -> None:

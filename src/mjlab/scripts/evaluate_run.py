@@ -24,7 +24,7 @@ class EvaluateConfig(PolicyFlags):
     num_episodes: int = 256
     """Episodes to play, one in each environment."""
     max_steps: int | None = None
-    """Steps after which an episode is cut off; None is the task's episode length."""
+    """Steps after which an episode is cut off; None is the episode length of evaluations."""
     seed: int = 0
     """Seed of the evaluation."""
     json: bool = False
@@ -34,7 +34,8 @@ class EvaluateConfig(PolicyFlags):
 def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
     """Score a policy of `task`, print the figures, and return them.
 
-    Episodes are those of the task's training config, whose time limit is part of the task.
+    The environments are those of evaluations in training (`EvaluationCfg.prepare_env`): those of the
+    task's training config where it has none, because the time limit is part of the task.
     """
     from mjlab.rl.evaluate import evaluate_policy
     from mjlab.rl.success import required_return, success_definition
@@ -43,7 +44,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
         raise UserError(f"--num-episodes is {cfg.num_episodes}; at least 1 has to be played.")
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
-    env_cfg = env_cfg_of(task, cfg, checkpoint, play=False)
+    env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="evaluate")
     solved = load_rl_cfg(task, profile=cfg.profile).evaluation
     env = make_env(
         task,

@@ -35,7 +35,7 @@ def _command(argv: list[str]) -> None:
     from mjlab.scripts.play_run import PlayConfig, run_play
     from mjlab.scripts.policy import parse_policy_flags
 
-    run_play(task, parse_policy_flags(PlayConfig, flags, task, "play", play=True))
+    run_play(task, parse_policy_flags(PlayConfig, flags, task, "play", purpose="play"))
 
 
 def main() -> None:

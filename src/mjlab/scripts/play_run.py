@@ -73,7 +73,7 @@ def run_play(task: str, cfg: PlayConfig) -> None:
         raise UserError(f"--port is {cfg.port}; ports go from 1 to 65535.")
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
-    env_cfg = env_cfg_of(task, cfg, checkpoint, play=True)
+    env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="play")
     if cfg.no_terminations:
         env_cfg.terminations = {}
     if cfg.video:

@@ -68,10 +68,11 @@ class PolicyFlags:
 
 
 F = TypeVar("F", bound=PolicyFlags)
+Purpose = Literal["play", "evaluate", "train"]
 
 
 def parse_policy_flags(
-    kind: type[F], flags: list[str], task: str, command: str, *, play: bool
+    kind: type[F], flags: list[str], task: str, command: str, *, purpose: Purpose
 ) -> F:
     """Return what `flags` make of the defaults of `kind`, under the profile of the policy they name.
 
@@ -80,14 +81,14 @@ def parse_policy_flags(
         flags: The command line, after the task.
         task: Name of the task.
         command: The command, for messages.
-        play: Whether the environment is the task's own to play with, or to train with.
+        purpose: What the environments are for; see `policy_env_cfg`.
 
     Raises:
         UnknownProfileError: the task has no such profile.
     """
     return parse_with_profile(
         lambda profile: with_task_options(
-            kind(env=policy_env_cfg(task, profile, play=play), profile=profile), task
+            kind(env=policy_env_cfg(task, profile, purpose=purpose), profile=profile), task
         ),
         lambda cfg: profile_of_policy(task, cfg),
         flags,
@@ -250,9 +251,9 @@ def make_env(
 
 
 def env_cfg_of(
-    task: str, flags: PolicyFlags, checkpoint: Path | None, *, play: bool
+    task: str, flags: PolicyFlags, checkpoint: Path | None, *, purpose: Purpose
 ) -> ManagerBasedRlEnvCfg:
-    """Return the environment config in `flags`, or the task's own to `play` or to train with.
+    """Return the environment config in `flags`, or the task's own for this purpose.
 
     The task has got what it needs for the policy in `checkpoint`.
 
@@ -260,24 +261,32 @@ def env_cfg_of(
         ValueError: something that the task needs is not there.
     """
     cfg = flags.env
-    cfg = policy_env_cfg(task, flags.profile, play=play) if cfg is None else copy.deepcopy(cfg)
+    if cfg is None:
+        cfg = policy_env_cfg(task, flags.profile, purpose=purpose)
+    cfg = copy.deepcopy(cfg)
     is_fetched = checkpoint is not None and flags.checkpoint_file is None
     prepare_env_cfg(task, flags, cfg, checkpoint, flags.wandb_run_path if is_fetched else None)
     return cfg
 
 
-def policy_env_cfg(task: str, profile: str | None, *, play: bool) -> ManagerBasedRlEnvCfg:
-    """Return the environment config that shows what a policy trained under `profile` can do.
+def policy_env_cfg(task: str, profile: str | None, *, purpose: Purpose) -> ManagerBasedRlEnvCfg:
+    """Return the environment config for a policy trained under `profile`.
 
     It has as many environments as the task has without the profile: how many of them learning takes
-    says nothing about how many to look at. To score a policy it is the config of evaluations in
-    training; to `play` one too, under a profile, since what the profile makes easier for learning is
-    to be shown as hard as it is.
+    says nothing about how many to look at.
+
+    Args:
+        task: Name of the task.
+        profile: The profile, or None.
+        purpose: `train` for the config of training; `evaluate` for that of evaluations in training;
+            `play` for the task's own to play with, in which what the profile makes easier for
+            learning is as hard as it is in evaluations.
     """
-    cfg = load_env_cfg(task, play=play, profile=profile)
+    cfg = load_env_cfg(task, play=purpose == "play", profile=profile)
     if profile is not None:
-        cfg.scene.num_envs = load_env_cfg(task, play=play).scene.num_envs
+        cfg.scene.num_envs = load_env_cfg(task, play=purpose == "play").scene.num_envs
     prepare = load_rl_cfg(task, profile=profile).evaluation.prepare_env
-    if prepare is not None and (profile is not None or not play):
+    is_wanted = purpose == "evaluate" or (purpose == "play" and profile is not None)
+    if prepare is not None and is_wanted:
         prepare(cfg)
     return cfg

@@ -33,7 +33,8 @@ def _command(argv: list[str]) -> None:
     from mjlab.scripts.policy import parse_policy_flags
     from mjlab.scripts.profile_env_run import ProfileConfig, run_profile_env
 
-    run_profile_env(task, parse_policy_flags(ProfileConfig, flags, task, "profile-env", play=False))
+    cfg = parse_policy_flags(ProfileConfig, flags, task, "profile-env", purpose="train")
+    run_profile_env(task, cfg)
 
 
 def main() -> None:

@@ -60,7 +60,7 @@ def run_profile_env(task: str, cfg: ProfileConfig) -> dict[str, Any]:
     checkpoint = find_checkpoint(task, cfg)
     env = make_env(
         task,
-        env_cfg_of(task, cfg, checkpoint, play=False),
+        env_cfg_of(task, cfg, checkpoint, purpose="train"),
         device,
         cfg.num_envs,
         cfg.engine,

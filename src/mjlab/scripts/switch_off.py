@@ -28,6 +28,8 @@ _TERM_DICTS = frozenset(
         "recorders",
     )
 )
+# Further configs that are off where they are None, and have flags for what is in them.
+_OPTIONAL = frozenset(("symmetry_cfg",))
 
 
 def switch_terms_off(default: C, flags: list[str]) -> tuple[C, list[str]]:
@@ -41,8 +43,10 @@ def switch_terms_off(default: C, flags: list[str]) -> tuple[C, list[str]]:
         holder, name = _term_at(config, flag) if value == "None" else (None, "")
         if holder is None:
             remaining += words
-        else:
+        elif isinstance(holder, dict):
             holder[name] = None
+        else:
+            setattr(holder, name, None)
     return config, remaining
 
 
@@ -65,8 +69,8 @@ def _flag_values(flags: list[str]) -> Iterator[tuple[str, str | None, list[str]]
         position += 1
 
 
-def _term_at(config: Any, flag: str) -> tuple[dict[str, Any] | None, str]:
-    """Return the dict that holds the term named by `flag`, and its key; (None, "") if none does."""
+def _term_at(config: Any, flag: str) -> tuple[Any, str]:
+    """Return the dict or config that holds what `flag` names, and its key; (None, "") if none does."""
     if not flag.startswith("--"):
         return None, ""
     holder: Any = None
@@ -81,7 +85,8 @@ def _term_at(config: Any, flag: str) -> tuple[dict[str, Any] | None, str]:
         value = holder[key] if isinstance(holder, Mapping) else getattr(holder, key)
         if not is_dataclass(value) and not isinstance(value, Mapping):
             return None, ""
-    return (holder, key) if isinstance(holder, dict) and inside in _TERM_DICTS else (None, "")
+    is_term = isinstance(holder, dict) and inside in _TERM_DICTS
+    return (holder, key) if is_term or key in _OPTIONAL else (None, "")
 
 
 def _spelled_alike(name: Any, part: str) -> bool:

@@ -299,7 +299,7 @@ def _leave_results(task: str, cfg: TrainConfig, run_dir: Path, device: str) -> N
         from mjlab.scripts.record import VideoCfg, record_policy
         from mjlab.viewer.errors import RenderingUnavailableError
 
-        env_cfg = policy_env_cfg(task, cfg.profile, play=True)
+        env_cfg = policy_env_cfg(task, cfg.profile, purpose="play")
         prepare_env_cfg(task, None, env_cfg, checkpoint)
         try:
             record_policy(

@@ -1,4 +1,7 @@
-"""Contacts that take the solver half the time, for `cpu` profiles."""
+"""Contacts that are quicker to solve, for `cpu` profiles.
+
+On the Go1 that walks, the physics of a step takes half the time.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ _SLIDING = 3
 def simplify_contacts(
     env_cfg: ManagerBasedRlEnvCfg,
 ) -> Callable[[ManagerBasedRlEnvCfg], None]:
-    """Give contacts of the robot a pyramidal friction cone, and no rolling or torsional friction.
+    """Make friction cones pyramidal, and take rolling and torsional friction from the robot.
 
     Edits the config in place. Returns what gives such a config, or a copy, the contacts back.
     """
@@ -22,8 +25,11 @@ def simplify_contacts(
     condim = [collision.condim for collision in collisions]
     env_cfg.sim.mujoco.cone = "pyramidal"
     for collision in collisions:
-        if isinstance(collision.condim, dict):
-            collision.condim = {name: min(dim, _SLIDING) for name, dim in collision.condim.items()}
+        dims = collision.condim
+        if isinstance(dims, dict):
+            collision.condim = {name: min(dim, _SLIDING) for name, dim in dims.items()}
+        elif dims is not None:
+            collision.condim = min(dims, _SLIDING)
 
     def undo(simple: ManagerBasedRlEnvCfg) -> None:
         simple.sim.mujoco.cone = cone

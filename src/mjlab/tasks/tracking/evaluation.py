@@ -61,7 +61,8 @@ TRACKING_ERRORS = {
 def play_motions_once(cfg: Any) -> None:
     """Edit an environment's config so that each episode is one motion, from its start to its end.
 
-    Nothing pushes. Noise, randomization and the perturbation of the start stay as they are.
+    Nothing pushes. Noise, randomization and the perturbation of the start stay as they are. A motion
+    of more than an hour is cut.
     """
     motion = cfg.commands[_COMMAND]
     assert isinstance(motion, MotionCommandCfg)

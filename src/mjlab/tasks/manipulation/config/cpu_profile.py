@@ -3,7 +3,8 @@
 A few cores step some ten thousand environments a second, a hundredth of a GPU. So a batch is small,
 and the networks are small enough for their update not to take longer than the physics.
 
-The task's own reward for reaching is so wide (0.2 m) that closed fingers on top of the cube get 98 %
+That is all that the tasks from images get; how fast these learn has not been measured. From the state,
+the task's own reward for reaching is so wide (0.2 m) that closed fingers on top of the cube get 98 %
 of it, and a gripper takes half a second to open or to close. So training has a narrow one beside it,
 which only open fingers around the cube can get, and contacts without rolling and torsional friction.
 Evaluations, `evaluate` and `play` have neither.
@@ -52,6 +53,8 @@ def cpu_vision(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) ->
     env_cfg.scene.num_envs = 256
     rl_cfg.actor.hidden_dims = rl_cfg.critic.hidden_dims = (128, 64)
     _learn_from_small_batches(rl_cfg)
+    # Of at most 3000.
+    rl_cfg.evaluation.trigger_return = 1800.0
 
 
 def _learn_from_small_batches(rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
@@ -63,6 +66,5 @@ def _learn_from_small_batches(rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     rl_cfg.save_interval = 200
     evaluation = rl_cfg.evaluation
     evaluation.num_episodes = 256
-    evaluation.trigger_return = 3000.0
     evaluation.min_interval = 150
     evaluation.solved_above = {"success_rate": 0.9}

@@ -6,24 +6,13 @@ and the networks are small enough for their update not to take longer than the p
 
 from __future__ import annotations
 
-from typing import Any
-
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import RslRlOnPolicyRunnerCfg, gaussian_distribution
-from mjlab.tasks.simple_contacts import simplify_contacts
 
 
 def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     """Edit the configs of a tracking task in place."""
     env_cfg.scene.num_envs = 512
-    undo_contacts, prepare = simplify_contacts(env_cfg), rl_cfg.evaluation.prepare_env
-
-    def undo_and_prepare(cfg: Any) -> None:
-        undo_contacts(cfg)
-        if prepare is not None:
-            prepare(cfg)
-
-    rl_cfg.evaluation.prepare_env = undo_and_prepare
     rl_cfg.actor.hidden_dims = rl_cfg.critic.hidden_dims = (256, 128)
     rl_cfg.actor.distribution_cfg = gaussian_distribution(0.5)
     rl_cfg.algorithm.entropy_coef = 0.005

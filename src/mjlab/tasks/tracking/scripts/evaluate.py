@@ -74,7 +74,7 @@ def run_evaluate_tracking(task: str, cfg: EvaluateTrackingConfig) -> dict[str, f
 
 def _command(argv: list[str]) -> None:
     task, flags = task_and_flags(argv, _USAGE)
-    cfg = parse_policy_flags(EvaluateTrackingConfig, flags, task, _NAME, play=False)
+    cfg = parse_policy_flags(EvaluateTrackingConfig, flags, task, _NAME, purpose="evaluate")
     run_evaluate_tracking(task, cfg)
 
 
