@@ -13,6 +13,7 @@ import torch
 
 from mjlab.asset_zoo.robots import get_go1_robot_cfg
 from mjlab.envs import ManagerBasedRlEnv
+from mjlab.tasks.registry import load_rl_cfg
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "velocity.md"
 
@@ -25,7 +26,7 @@ def example(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     robots.get_my_robot_cfg = get_go1_robot_cfg
     monkeypatch.setitem(sys.modules, "my_robots", robots)
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(blocks) == 2
+    assert len(blocks) == 3
     namespace: dict[str, Any] = {}
     for block in blocks:
         exec(block, namespace)
@@ -45,6 +46,11 @@ def test_the_example_builds_and_steps(example, name, play):
     assert torch.isfinite(reward).all()
     assert (reward > 0.0).all()
     env.close()
+
+
+def test_the_snippet_about_mirror_images_is_that_of_the_profile(example):
+    profile = load_rl_cfg("Mjlab-Velocity-Flat-Unitree-G1", profile="cpu")
+    assert example["rl_cfg"].algorithm.symmetry_cfg == profile.algorithm.symmetry_cfg
 
 
 def test_the_snippet_about_the_elapsed_time_sets_a_parameter_that_exists(example, make_env):

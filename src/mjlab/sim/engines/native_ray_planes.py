@@ -75,8 +75,7 @@ class StaticPlanes:
 def _along(axis: Array, vectors: Array, origin: Array | None = None) -> Array:
     """Return coordinates along `axis` (3,) of vectors (n, R, 3), from `origin` if there is one."""
     total = np.zeros(vectors.shape[:2])
-    # Axes of a level ground, the usual case, have one component; the others are left out.
-    for k in np.flatnonzero(axis):
+    for k in range(3):
         part = vectors[..., k].astype(np.float64)
         if origin is not None:
             part -= origin[k]
