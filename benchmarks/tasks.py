@@ -91,7 +91,7 @@ def measure_case(case: Case) -> Row:
 
     same_states()
     env_time, bare_time = alternate(
-        bare, lambda: env.step(actions), steps=1, repeats=101, before=same_states
+        bare, lambda: env.step(actions), steps=1, repeats=51, before=same_states
     )[::-1]
     ratio = bare_time / env_time
     rays = ", same rays" if case.with_rays else ""
