@@ -260,10 +260,10 @@ def env_cfg_of(
     Raises:
         ValueError: something that the task needs is not there.
     """
-    cfg = flags.env
-    if cfg is None:
+    if flags.env is None:
         cfg = policy_env_cfg(task, flags.profile, purpose=purpose)
-    cfg = copy.deepcopy(cfg)
+    else:
+        cfg = copy.deepcopy(flags.env)
     is_fetched = checkpoint is not None and flags.checkpoint_file is None
     prepare_env_cfg(task, flags, cfg, checkpoint, flags.wandb_run_path if is_fetched else None)
     return cfg
@@ -282,11 +282,12 @@ def policy_env_cfg(task: str, profile: str | None, *, purpose: Purpose) -> Manag
             `play` for the task's own to play with, in which what the profile makes easier for
             learning is as hard as it is in evaluations.
     """
-    cfg = load_env_cfg(task, play=purpose == "play", profile=profile)
+    play = purpose == "play"
+    cfg = load_env_cfg(task, play=play, profile=profile)
     if profile is not None:
-        cfg.scene.num_envs = load_env_cfg(task, play=purpose == "play").scene.num_envs
-    prepare = load_rl_cfg(task, profile=profile).evaluation.prepare_env
-    is_wanted = purpose == "evaluate" or (purpose == "play" and profile is not None)
-    if prepare is not None and is_wanted:
-        prepare(cfg)
+        cfg.scene.num_envs = load_env_cfg(task, play=play).scene.num_envs
+    if purpose == "evaluate" or (play and profile is not None):
+        prepare = load_rl_cfg(task, profile=profile).evaluation.prepare_env
+        if prepare is not None:
+            prepare(cfg)
     return cfg
