@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cameras
 import learning
+import live_view
 import reach
 import repeatability
 import startup
@@ -16,10 +17,10 @@ from report import RESULTS, Row, show, write
 def main() -> None:
     rows: list[Row] = []
     quick = (throughput, tasks, cameras, reach, startup, repeatability)
-    for benchmark in (*quick, learning, walking):
+    for benchmark in (*quick, learning, live_view, walking):
         print(f"{benchmark.__name__} ...", flush=True)
         rows += benchmark.measure()
-        # Written after each, so that a long run that is stopped has left what it measured.
+        # Written after each, so that a run that is stopped has left what it measured.
         write(rows)
     print(show(rows))
     print(f"\nWritten to {RESULTS / 'table.md'}")

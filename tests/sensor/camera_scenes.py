@@ -9,6 +9,9 @@ from mjlab.scene import Scene, SceneCfg
 from mjlab.sensor.sensor import SensorCfg
 from mjlab.sim import Simulation, SimulationCfg
 
+from .simulated import sense as sense
+from .simulated import simulation_of
+
 ENGINES = ("native", "warp")
 
 # A sphere above a floor. All numbers are known by hand.
@@ -93,14 +96,4 @@ def scene_with(
         sensors=sensors,
     )
     scene = Scene(cfg, "cpu")
-    sim = Simulation(num_envs, SimulationCfg(engine=engine), spec=scene.spec, device="cpu")
-    scene.initialize(sim.mj_model, sim.model, sim.data)
-    sim.add_forward_callback(scene.invalidate_sensor_caches)
-    if scene.sensor_context is not None:
-        sim.set_sensor_context(scene.sensor_context)
-    return sim, scene
-
-
-def sense(sim: Simulation) -> None:
-    sim.forward()
-    sim.sense()
+    return simulation_of(scene, SimulationCfg(engine=engine)), scene

@@ -14,6 +14,8 @@ from mjlab.sensor import ContactMatch, ContactSensorCfg, SensorCfg
 from mjlab.sim import MujocoCfg, Simulation, SimulationCfg
 from mjlab.terrains.terrain_entity import TerrainEntityCfg
 
+from .simulated import simulation_of
+
 DT = 0.004
 GRAVITY = 9.81
 
@@ -78,10 +80,7 @@ def simulate(
     cfg.engine = engine
     cfg.num_threads = 1
     cfg.mujoco = MujocoCfg(timestep=DT, **options)
-    simulation = Simulation(scene.num_envs, cfg, spec=scene.spec, device="cpu")
-    scene.initialize(simulation.mj_model, simulation.model, simulation.data)
-    simulation.add_forward_callback(scene.invalidate_sensor_caches)
-    return simulation
+    return simulation_of(scene, cfg)
 
 
 def build(*sensors: SensorCfg, engine: str = "native", gravity=None, cone="elliptic", **parts):

@@ -13,6 +13,9 @@ from mjlab.sensor import ObjRef
 from mjlab.sensor.sensor import SensorCfg
 from mjlab.sim import Simulation, SimulationCfg
 
+from .simulated import sense as sense
+from .simulated import simulation_of
+
 ROBOT = """
 <mujoco><worldbody><body name="base" pos="0 0 1"><freejoint/>
   <geom name="shell" type="sphere" size=".2" group="2"/>
@@ -67,14 +70,4 @@ def scene_with(
     }
     cfg = SceneCfg(num_envs=num_envs, entities=cfgs, sensors=sensors, spec_fn=ground)
     scene = Scene(cfg, "cpu")
-    sim = Simulation(num_envs, SimulationCfg(engine=engine), spec=scene.spec, device="cpu")
-    scene.initialize(sim.mj_model, sim.model, sim.data)
-    sim.add_forward_callback(scene.invalidate_sensor_caches)
-    if scene.sensor_context is not None:
-        sim.set_sensor_context(scene.sensor_context)
-    return sim, scene
-
-
-def sense(sim: Simulation) -> None:
-    sim.forward()
-    sim.sense()
+    return simulation_of(scene, SimulationCfg(engine=engine)), scene

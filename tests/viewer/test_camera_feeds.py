@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,9 +17,7 @@ from mjlab.viewer.viser.camera_feeds import (
     vertical_angle,
 )
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "sensor"))
-
-from camera_scenes import BALL, scene_with, sense
+from ..sensor.camera_scenes import BALL, scene_with, sense  # noqa: TID252
 
 ALL = ("rgb", "depth", "segmentation")
 

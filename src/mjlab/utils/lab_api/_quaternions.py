@@ -118,8 +118,12 @@ def quat_box_plus(q: torch.Tensor, delta: torch.Tensor, eps: float = 1.0e-6) -> 
 
 
 def quat_error_magnitude(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
-    """Return the angle between two orientations, in [0, pi]; (...)."""
-    return torch.linalg.vector_norm(quat_box_minus(q1, q2), dim=-1)
+    """Return the angle between two orientations, unit quaternions, in [0, pi]; (...)."""
+    # Chords of the unit sphere are cheap, and precise for small angles: |q1 - q2| = 2 sin(angle / 4)
+    # and |q1 + q2| = 2 cos(angle / 4), or the other way round where one of them is to be negated.
+    away = torch.linalg.vector_norm(q1 - q2, dim=-1)
+    along = torch.linalg.vector_norm(q1 + q2, dim=-1)
+    return 4.0 * torch.atan2(torch.minimum(away, along), torch.maximum(away, along))
 
 
 def quat_slerp(q1: torch.Tensor, q2: torch.Tensor, tau: float) -> torch.Tensor:
