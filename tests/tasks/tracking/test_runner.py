@@ -12,7 +12,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from tracking_tasks import G1, G1_BLIND, part_of, task_cfg
+from tracking_tasks import G1, G1_BLIND, part_of
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl import RslRlVecEnvWrapper
@@ -24,31 +24,6 @@ from mjlab.tasks.tracking.motion_record import record_motions, recorded_motions
 from mjlab.tasks.tracking.motion_sources import shipped_motions
 from mjlab.tasks.tracking.options import MotionOptions
 from mjlab.tasks.tracking.rl import MotionTrackingOnPolicyRunner
-from mjlab.utils.random import seed_rng
-
-
-@pytest.fixture
-def make_runner():
-    """Build runners of a small policy in small environments, writing to a folder."""
-    built = []
-
-    def make(
-        log_dir: Path | None = None, num_envs=6, task=G1, motion="squat,wave", **kwargs
-    ) -> MotionTrackingOnPolicyRunner:
-        seed_rng(1)
-        env = ManagerBasedRlEnv(task_cfg(motion, num_envs=num_envs, task=task), device="cpu")
-        built.append(env)
-        cfg = asdict(load_rl_cfg(task))
-        cfg["num_steps_per_env"], cfg["save_interval"] = 4, 100
-        for model in ("actor", "critic"):
-            cfg[model]["hidden_dims"] = (16,)
-        cfg["logger"] = kwargs.pop("logger", "tensorboard")
-        folder = None if log_dir is None else str(log_dir)
-        return MotionTrackingOnPolicyRunner(RslRlVecEnvWrapper(env), cfg, folder, "cpu", **kwargs)
-
-    yield make
-    for env in built:
-        env.close()
 
 
 def weights(runner) -> torch.Tensor:

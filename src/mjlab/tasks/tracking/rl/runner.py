@@ -13,6 +13,7 @@ from mjlab.rl.rsl import VecEnv
 from mjlab.tasks.tracking.mdp.motion_command import MotionCommand
 from mjlab.tasks.tracking.motion_record import record_motions
 from mjlab.tasks.tracking.rl.onnx_model import PolicyWithReference
+from mjlab.tasks.tracking.rl.reference_actor import ReferenceActor
 from mjlab.tasks.tracking.wandb_motions import full_artifact_name
 
 logger = logging.getLogger(__name__)
@@ -47,10 +48,14 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
                 there is marked as using it.
 
         Raises:
-            ValueError: the environments have no motion command.
+            ValueError: the environments have no motion command, or none that a `ReferenceActor` can
+                follow.
         """
         super().__init__(env, train_cfg, log_dir, device)
         self.motion_command: MotionCommand = _motion_command(self.env.unwrapped)
+        actor = self.alg.get_policy()
+        if isinstance(actor, ReferenceActor):
+            actor.follow(self.env.unwrapped, self.motion_command)
         self._registry_name = registry_name
         self._is_marked = False
 

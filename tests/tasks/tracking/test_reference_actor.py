@@ -1,0 +1,111 @@
+"""The actor of the `cpu` profile asks for the reference's pose before it has learned anything."""
+
+from __future__ import annotations
+
+import onnxruntime
+import pytest
+import torch
+from tracking_tasks import G1, G1_BLIND
+
+from mjlab.envs import mdp
+from mjlab.managers import ObservationTermCfg
+from mjlab.rl.onnx_policy import load_onnx_policy
+from mjlab.tasks.tracking.rl.reference_actor import ReferenceActor
+
+ACTOR = "mjlab.tasks.tracking.rl.reference_actor:ReferenceActor"
+
+
+def wanted_actions(runner) -> torch.Tensor:
+    """Return the actions that ask for the pose of the reference, from the terms themselves."""
+    env, command = runner.env.unwrapped, runner.motion_command
+    term = env.action_manager.get_term("joint_pos")
+    joints = [command.robot.joint_names.index(name) for name in term.target_names]
+    return (command.joint_pos[:, joints] - term.offset) / term.scale
+
+
+def forget_what_is_learned(actor: ReferenceActor) -> None:
+    for parameter in actor.with_reference.mlp.parameters():
+        torch.nn.init.zeros_(parameter)
+
+
+def shift(cfg) -> None:
+    """Put another term before the command."""
+    terms = cfg.observations["actor"].terms
+    gravity = ObservationTermCfg(func=mdp.projected_gravity)
+    cfg.observations["actor"].terms = {"gravity": gravity, **terms}
+
+
+@pytest.mark.parametrize("edit", [None, shift])
+@pytest.mark.parametrize("task", [G1, G1_BLIND])
+def test_the_actor_asks_for_the_reference(make_runner, task, edit):
+    runner = make_runner(task=task, actor=ACTOR, edit=edit)
+    actor = runner.alg.get_policy()
+    forget_what_is_learned(actor)
+    obs = runner.env.get_observations()
+    # Statistics of observations that move must not move what is asked for.
+    for _ in range(3):
+        actor.update_normalization(obs)
+    torch.testing.assert_close(actor(obs), wanted_actions(runner), atol=1e-4, rtol=1e-4)
+
+
+def test_what_is_learned_is_added_and_little_at_first(make_runner):
+    runner = make_runner(actor=ACTOR)
+    actor, obs = runner.alg.get_policy(), runner.env.get_observations()
+    learned = actor(obs) - wanted_actions(runner)
+    assert 0.0 < learned.abs().max() < 0.1
+
+
+def test_training_changes_what_is_learned_alone_and_checkpoints_keep_it(make_runner, tmp_path):
+    runner = make_runner(tmp_path / "run", actor=ACTOR)
+    actor = runner.alg.get_policy()
+    weight = actor.with_reference.weight.clone()
+    before = actor.with_reference.mlp[0].weight.detach().clone()
+    runner.learn(2)
+    assert torch.equal(actor.with_reference.weight, weight)
+    assert not torch.equal(actor.with_reference.mlp[0].weight, before)
+    other = make_runner(actor=ACTOR)
+    other.load(str(tmp_path / "run" / "model_1.pt"))
+    obs = runner.env.get_observations()
+    actor.eval()
+    policy = other.alg.get_policy().eval()
+    torch.testing.assert_close(policy(obs), actor(obs))
+
+
+def test_the_export_asks_for_the_same(make_runner, tmp_path):
+    runner = make_runner(tmp_path / "run", actor=ACTOR)
+    runner.learn(2)
+    session = onnxruntime.InferenceSession(tmp_path / "run" / "run.onnx")
+    actor, obs = runner.alg.get_policy().eval(), runner.env.get_observations()
+    played = load_onnx_policy(tmp_path / "run" / "run.onnx", runner.env, "cpu")
+    torch.testing.assert_close(played(obs), actor(obs), atol=1e-4, rtol=1e-4)
+    for row, expected in zip(obs["actor"], actor(obs).detach(), strict=True):
+        inputs = {"obs": row[None].numpy(), "time_step": torch.zeros(1, 1).numpy()}
+        exported = torch.from_numpy(session.run(["actions"], inputs)[0][0])
+        torch.testing.assert_close(exported, expected, atol=1e-4, rtol=1e-4)
+
+
+def scale_command(cfg) -> None:
+    cfg.observations["actor"].terms["command"].scale = 0.5
+
+
+def drop_command(cfg) -> None:
+    cfg.observations["actor"].terms.pop("command")
+
+
+def relative_actions(cfg) -> None:
+    cfg.actions["joint_pos"] = mdp.RelativeJointPositionActionCfg(
+        entity_name="robot", actuator_names=(".*",)
+    )
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (scale_command, "needs the motion command among the actor's observations"),
+        (drop_command, "needs the motion command among the actor's observations"),
+        (relative_actions, "needs one action term, of joint positions"),
+    ],
+)
+def test_what_cannot_be_followed_is_refused_when_training_is_built(make_runner, edit, message):
+    with pytest.raises(ValueError, match=message):
+        make_runner(actor=ACTOR, edit=edit)
