@@ -38,6 +38,8 @@ TASK, SENSOR, SIZE = "Mjlab-Lift-Cube-Yam-Rgb", "camera_d405", 32
 # Images a second of two cores that are to be reached.
 BOTH, COLOURS = "depth and segmentation", "colours"
 WANTED = {BOTH: 4000.0, COLOURS: 2500.0}
+# How many times MuJoCo's renderer in software, drawing the same images, is to be reached.
+TIMES_RENDERER = {BOTH: 100.0, COLOURS: 0.0}
 BARE, RENDERER = "bare `mjbatch.rays`", "MuJoCo's renderer"
 REPEATS = 15
 
@@ -161,13 +163,18 @@ def row(name: str, speeds: dict[str, float], same: float) -> Row:
     """Return the line of one kind of images; `same` is the share of pixels equal to bare rays'."""
     beside = {BARE: speeds[BARE]} | {k: v for k, v in speeds.items() if k.startswith(RENDERER)}
     shown = "; ".join(f"{k}: {v:,.4g}/s ({speeds[name] / v:,.3g} x)" for k, v in beside.items())
+    wanted, times = f"{WANTED[name]:,.0f} images/s", TIMES_RENDERER[name]
+    reached = speeds[name] >= WANTED[name]
+    if times:
+        wanted += f", and {times:.0f} x MuJoCo's renderer"
+        reached = reached and speeds[name] >= times * speeds.get(f"{RENDERER}, {name}", np.inf)
     agreed = f"; {same:.2%} of pixels show what bare rays meet" if name == BOTH else ""
     return Row(
         f"cameras, {SIZE} x {SIZE}, lift-cube scene, native: {name}",
         f"{speeds[name]:,.0f} images/s{agreed}",
         shown if len(beside) > 1 else f"{shown}; no OpenGL here",
-        f"{WANTED[name]:,.0f} images/s",
-        speeds[name] >= WANTED[name],
+        wanted,
+        reached,
     )
 
 

@@ -176,11 +176,11 @@ def test_meshes_and_primitives_that_differ_share_slots_by_what_cannot_vary() -> 
     spec, metadata = build_merged_variant_spec(VariantEntityCfg(variants=THINGS))
     assert metadata.variant_names == tuple(THINGS)
     assert [slot.key for slot in metadata.slots] == [
-        *(SlotKey("/thing", "visual", k) for k in range(2)),
+        *(SlotKey("/thing", "visual", k) for k in range(3)),
         *(SlotKey("/thing", "collision", k) for k in range(5)),
     ]
-    # Box; sphere of the ball and the dumbbell; its second one; mesh; mesh of condim 4.
-    collision = [[geom is not None for geom in own][2:] for own in metadata.variant_slot_specs]
+    # Box; sphere of the ball and the dumbbell; its one of another priority; mesh; mesh of condim 4.
+    collision = [[geom is not None for geom in own][3:] for own in metadata.variant_slot_specs]
     assert collision == [
         [True, False, False, False, False],
         [False, True, False, False, False],
@@ -190,10 +190,12 @@ def test_meshes_and_primitives_that_differ_share_slots_by_what_cannot_vary() -> 
     ]  # fmt: skip
     names = {geom.name for geom in spec.geoms}
     assert names == {"cover", *(slot.template_geom_name for slot in metadata.slots)}
-    assert metadata.slots[2].template_geom_name == "mjlab/pad/thing/collision/0"
-    assert metadata.slots[2].source_geom_names == ("shell", None, None, None, None)
-    assert metadata.num_mesh_geoms == 3
-    assert metadata.variant_mesh_names[3] == (None, "steep", None, None, None, "wedge", None)
+    assert metadata.slots[3].template_geom_name == "mjlab/pad/thing/collision/0"
+    assert metadata.slots[3].source_geom_names == ("shell", None, None, None, None)
+    assert metadata.num_mesh_geoms == 4
+    assert metadata.variant_mesh_names[3] == (None, "steep", *(None,) * 4, "wedge", None)
+    # Visual meshes of other groups.
+    assert metadata.variant_mesh_names[4] == (None, None, "wedge", *(None,) * 4, "steep")
 
 
 def test_meshes_alone_fill_as_many_slots_as_the_richest_variant_has() -> None:

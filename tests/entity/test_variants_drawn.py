@@ -96,8 +96,8 @@ def test_the_page_draws_each_environment_with_its_own_shapes(viser_server) -> No
     shapes = scene._variants._shapes.values()
     body, lid = sim.mj_model.body("thing/thing").id, sim.mj_model.body("thing/lid").id
     of_things = sorted(tuple(shape.envs) for shape in shapes if body in shape.bodies)
-    # The visual mesh of the fourth thing is in a group of its own.
-    assert of_things == [(0,), (1,), (2,), (3,), (3,), (4,)]
+    # The visual meshes of the fourth and the fifth thing are in groups of their own.
+    assert of_things == [(0,), (1,), (2,), (3,), (3,), (4,), (4,)]
     lids = sorted(tuple(shape.envs) for shape in shapes if lid in shape.bodies)
     assert lids == [(0, 1, 3, 4), (2,)]
 

@@ -83,7 +83,10 @@ def _rounded(values: Any) -> list[float]:
 def test_every_environment_has_the_geoms_of_its_variants_with_their_bounds(engine: str) -> None:
     sim, _ = world(engine)
     model = sim.mj_model
-    fields = ("size", "rbound", "aabb", "pos", "friction", "solref", "rgba", "margin")
+    shared = ("type", "condim", "contype", "conaffinity", "group", "priority")
+    fields = ("size", "rbound", "aabb", "pos", "friction", "rgba")
+    fields += ("solref", "solimp", "solmix", "margin", "gap")
+    seen = {name: set() for name in (*shared, *fields)}
     for env in range(NUM_ENVS):
         reference = alone(env).mj_model
         for body in ("thing/thing", "thing/lid", "bead/bead"):
@@ -93,7 +96,7 @@ def test_every_environment_has_the_geoms_of_its_variants_with_their_bounds(engin
             found, expected = (
                 sorted(
                     [
-                        (int(m.geom_type[i]), int(m.geom_condim[i]), int(m.geom_contype[i])),
+                        tuple(int(getattr(m, f"geom_{name}")[i]) for name in shared),
                         *(_rounded(get(f"geom_{name}", i)) for name in fields),
                     ]
                     for i in chosen
@@ -104,6 +107,11 @@ def test_every_environment_has_the_geoms_of_its_variants_with_their_bounds(engin
                 )
             )
             assert str(found) == str(expected)
+            for values, *more in expected if body == "thing/thing" else ():
+                for name, value in zip(seen, (*values, *more), strict=True):
+                    seen[name].add(str(value))
+    # Where all things are alike, nothing would be compared.
+    assert {name for name, values in seen.items() if len(values) == 1} == set()
     assert sim.absent_geoms is not None
     assert (sim.model.geom_rgba[sim.absent_geoms][:, 3] == 0).all()
     meshes = torch.as_tensor(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)

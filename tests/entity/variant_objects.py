@@ -71,7 +71,9 @@ BALL = thing(
 )
 DUMBBELL = thing(
     "dumbbell",
-    '<geom type="sphere" size=".06" pos=".12 0 0" friction=".5"/><geom type="sphere" size=".06" pos="-.12 0 0"/>'
+    '<geom type="sphere" size=".06" pos=".12 0 0" priority="1"/>'
+    '<geom type="sphere" size=".06" pos="-.12 0 0" friction=".5" solimp=".8 .9 .002 .4 3"'
+    ' solmix=".5" margin=".004" gap=".003"/>'
     '<geom type="capsule" size=".02 .1" euler="0 90 0" contype="0" conaffinity="0" mass="0"/>',
     cover=".02 .06 .01",
 )
@@ -81,7 +83,12 @@ MESH = thing(
     '<geom type="mesh" mesh="steep" contype="0" conaffinity="0" group="2" mass="0"/>',
     paint="0 0 1 1",
 )
-ROUGH_MESH = thing("rough", '<geom type="mesh" mesh="steep" condim="4" friction="1.5 .02 .001"/>')
+ROUGH_MESH = thing(
+    "rough",
+    '<geom type="mesh" mesh="steep" condim="4" friction="1.5 .02 .001" margin=".002"'
+    ' solimp=".85 .95 .003 .5 2"/>'
+    '<geom type="mesh" mesh="wedge" contype="0" conaffinity="0" group="3" mass="0"/>',
+)
 
 THINGS = {"box": BOX, "ball": BALL, "dumbbell": DUMBBELL, "mesh": MESH, "rough": ROUGH_MESH}
 """Primitives of several types and numbers, meshes, and one of another condim."""

@@ -42,7 +42,8 @@ def unexplained(env: Any) -> torch.Tensor:
         ),
         (
             {"success_func": placed_at_goal},
-            "the object was brought to its goal (placed_at_goal), one step before the end",
+            "the object was at its goal, or, where time ran out on one too new, at the last "
+            "(placed_at_goal), one step before the end",
         ),
         (
             {"success_is_survival": True},

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
+import torch
 import yaml
 
+from mjlab.rl.rsl import resolve_callable
 from mjlab.scripts.policy import _agent_cfg, constant_policy
 from mjlab.tasks.registry import load_rl_cfg
 
@@ -40,10 +44,58 @@ def agent_cfg_of_task():
     return asdict(load_rl_cfg(TASK))
 
 
+REFERENCE_ACTOR = "mjlab.tasks.tracking.rl.reference_actor:ReferenceActor"
+CLASSES = [
+    "MLPModel",
+    "CNNModel",
+    "RNNModel",
+    "mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel",
+    REFERENCE_ACTOR,
+]
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_classes_of_the_run_replace_those_of_the_task_if_they_are_known(tmp_path, name):
+    cfg = agent_cfg_beside(tmp_path, {"actor": {"class_name": name}})
+    assert cfg["actor"] == {**agent_cfg_of_task()["actor"], "class_name": name}
+    assert issubclass(resolve_callable(name), torch.nn.Module)
+
+
+TRACKING = "Mjlab-Tracking-Flat-Unitree-G1"
+
+
+@pytest.mark.parametrize(
+    ("profile", "name"),
+    [("cpu", None), ("cpu", "MLPModel"), (None, REFERENCE_ACTOR)],
+)
+def test_runs_of_tracking_are_evaluated_and_played_with_the_class_they_had(
+    run, tmp_path, profile, name
+):
+    common = ("--log-root", str(tmp_path), "--device", "cpu")
+    flags = ["--num-envs", "4", "--agent.max-iterations", "2", "--agent.num-steps-per-env", "4"]
+    for network in ("actor", "critic"):
+        flags += [f"--agent.{network}.hidden-dims", "(8,)"]
+    flags += [] if profile is None else ["--profile", profile]
+    flags += [] if name is None else ["--agent.actor.class-name", name]
+    outcome = run("train", TRACKING, *common, *flags)
+    assert outcome.status == 0, outcome.err
+    short = ("--num-episodes", "2", "--max-steps", "3", "--json")
+    outcome = run("evaluate", TRACKING, *common, *short)
+    assert outcome.status == 0, outcome.err
+    assert json.loads(outcome.out)["num_episodes"] == 2
+    outcome = run("play", TRACKING, *common, "--viewer", "none", "--num-steps", "2")
+    assert outcome.status == 0, outcome.err
+    (checkpoint,) = tmp_path.glob("*/*/model_1.pt")
+    weights = torch.load(checkpoint, weights_only=False)["actor_state_dict"]
+    assert ("mlp.mlp.0.weight" in weights) == (name != "MLPModel")
+
+
 @pytest.mark.parametrize(
     "actor",
     [
         {"class_name": "pydoc:pipepager"},
+        {"class_name": "mjlab.rl.spatial_softmax:SpatialSoftmaxCNN"},
+        {"class_name": ["MLPModel"]},
         {"distribution_cfg": {"class_name": "pydoc:pipepager", "cmd": "touch pwned"}},
         {"cnn_cfg": {"class_name": "os:system"}},
         {"cnn_cfg": {"activation": {"deep": ["os:system"]}}},

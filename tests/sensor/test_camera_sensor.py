@@ -188,7 +188,8 @@ def test_two_sensors_that_want_one_camera_otherwise_are_refused():
         scene_with(camera("a", orthographic=True), camera("b"))
 
 
-def test_a_ray_sensor_in_the_scene_leaves_the_groups_of_a_camera_alone():
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_ray_sensor_in_the_scene_leaves_the_groups_of_a_camera_alone(engine):
     rays = RayCastSensorCfg(
         name="rays",
         frame=ObjRef("geom", "ball", entity="ball"),
@@ -196,7 +197,7 @@ def test_a_ray_sensor_in_the_scene_leaves_the_groups_of_a_camera_alone():
         include_geom_groups=(0, 1, 2, 3, 4, 5),
     )
     eye = camera(enabled_geom_groups=(0,))
-    sim, scene = scene_with(eye, rays, ball=BALL)
+    sim, scene = scene_with(eye, rays, engine=engine, ball=BALL)
     sense(sim)
     assert (scene["cam"].data.segmentation[..., 0] != sim.mj_model.geom("room/ball").id).all()
 

@@ -137,10 +137,15 @@ class ManagerBase(ABC):
         return {label: edit for label, edit in edits.items() if edit}
 
     def apply_config_edits(self, edits: Mapping[str, Any]) -> None:
-        """Repeat changes that `config_edits` returned; those of terms that are gone are skipped."""
-        live = self._live_cfgs()
-        for label in edits.keys() & live.keys():
-            write_changes(live[label], edits[label])
+        """Bring configs to where they were when `config_edits` returned this.
+
+        What it does not name is set to the value as built, because the configs may have been edited
+        since, by a first reset say. Changes of terms that are gone are skipped.
+        """
+        for label, cfg in self._live_cfgs().items():
+            undone = changes(plain_values(cfg), self._built_values[label])
+            write_changes(cfg, copy.deepcopy(undone))
+            write_changes(cfg, edits.get(label, {}))
 
     def _live_cfgs(self) -> dict[str, Any]:
         """Return the config that each term reads, by label."""

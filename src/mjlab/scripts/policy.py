@@ -15,9 +15,19 @@ from mjlab.scripts.run_folder import named_checkpoint, newest_checkpoint, read_a
 from mjlab.scripts.task_options import prepare_env_cfg, with_task_options
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 
-# What a run's own settings may change about the task's networks: sizes and switches. Names of
-# classes never come from a file, because rsl_rl would import and call whatever they name.
-_SIZES: dict[str, Callable[[Any], bool]] = {
+# The classes of networks that a run's own settings may name. No others come from a file, because
+# rsl_rl would import and call whatever they name.
+_CLASSES = (
+    "MLPModel",
+    "CNNModel",
+    "RNNModel",
+    "mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel",
+    "mjlab.tasks.tracking.rl.reference_actor:ReferenceActor",
+)
+
+# What a run's own settings may change about the task's networks.
+_SETTINGS: dict[str, Callable[[Any], bool]] = {
+    "class_name": lambda value: value in _CLASSES,
     "hidden_dims": lambda value: isinstance(value, list) and all(_is_count(v) for v in value),
     "activation": lambda value: isinstance(value, str) and value.isidentifier(),
     "obs_normalization": lambda value: isinstance(value, bool),
@@ -144,17 +154,17 @@ def load_policy(
 def _agent_cfg(task: str, checkpoint: Path, profile: str | None = None) -> dict[str, Any]:
     """Return the learner's config of `task`, with the networks that the checkpoint's run had.
 
-    The command line may have given them other sizes than the task and its profile do.
+    The command line may have given them other sizes and classes than the task and its profile do.
     """
     cfg = asdict(load_rl_cfg(task, profile=profile))
     saved = read_agent_params(checkpoint.parent)
     for network in ("actor", "critic"):
-        sizes = saved.get(network)
-        if not isinstance(sizes, dict):
+        settings = saved.get(network)
+        if not isinstance(settings, dict):
             continue
-        for name, is_valid in _SIZES.items():
-            if name in sizes and name in cfg[network] and is_valid(sizes[name]):
-                cfg[network][name] = sizes[name]
+        for name, is_valid in _SETTINGS.items():
+            if name in settings and name in cfg[network] and is_valid(settings[name]):
+                cfg[network][name] = settings[name]
     return cfg
 
 

@@ -157,6 +157,13 @@ def make_world() -> WorldFactory:
 
 
 @pytest.fixture
+def world_of() -> type[World]:
+    """Make a world of an entity's config, with the generator seeded."""
+    torch.manual_seed(0)
+    return World
+
+
+@pytest.fixture
 def make_cart(make_world: WorldFactory) -> WorldFactory:
     """Make a cart with a pole: a fixed base with a slide and a hinge."""
     return lambda **kwargs: make_world(CART_XML, **kwargs)

@@ -40,10 +40,15 @@ class Object:
 class Simulation:
     """Derives where objects are, as a forward pass does, and notes for which environments."""
 
-    def __init__(self, objects: dict[str, Object], geoms: int) -> None:
+    def __init__(self, objects: dict[str, Object], num_envs: int, geoms: int) -> None:
         self.objects = objects
         self.forwarded: list[list[int] | None] = []
         self.mj_model = cubes_model(geoms)
+        radii = torch.tensor(self.mj_model.geom_rbound, dtype=torch.float)
+        self.model = SimpleNamespace(
+            geom_pos=torch.zeros(num_envs, geoms, 3), geom_rbound=radii.expand(num_envs, -1)
+        )
+        self.absent_geoms = None
 
     def forward(self, env_ids: torch.Tensor | None = None) -> None:
         self.forwarded.append(None if env_ids is None else env_ids.tolist())
@@ -61,7 +66,7 @@ class StandInEnv:
         self.scene: Any = dict(self.objects)
         self.scene = SceneStandIn(self.objects, num_envs)
         geoms = 1 + max(int(one.indexing.geom_ids.max()) for one in self.objects.values())
-        self.sim = Simulation(self.objects, geoms)
+        self.sim = Simulation(self.objects, num_envs, geoms)
         self.command_manager = SimpleNamespace(get_term=lambda name: self.command)
         self.command: Any = None
 

@@ -5,12 +5,16 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import mujoco
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lifting_stand_ins import Object, StandInEnv, cubes, multi_cube_command
+from lifting_tasks import MULTI, lifting
 
+from mjlab.entity import VariantEntityCfg
+from mjlab.tasks.manipulation.config.yam.env_cfgs import get_cube_spec
 from mjlab.tasks.manipulation.mdp import MultiCubeLiftingCommandCfg
 from mjlab.tasks.manipulation.mdp.placement import keep_apart
 from mjlab.viewer.debug_visualizer import NullDebugVisualizer
@@ -112,6 +116,44 @@ def test_cubes_for_which_there_is_no_room_end_the_search_and_were_warned_about(c
 def test_cubes_for_which_there_is_room_are_not_warned_about(caplog):
     multi_cube_command(cubes(count=3))
     assert caplog.text == ""
+
+
+def knobbed_cube():
+    """Return a cube with another geom, which stands off its origin."""
+    spec = get_cube_spec()
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    spec.body("cube").add_geom(type=box, size=(0.01,) * 3, pos=(0.08, 0.0, 0.0))
+    return spec
+
+
+@pytest.mark.parametrize(
+    ("large", "radius"),
+    [
+        (lambda: get_cube_spec(cube_size=0.05), 0.05 * math.sqrt(3)),
+        (knobbed_cube, 0.08 + 0.01 * math.sqrt(3)),
+    ],
+    ids=["larger", "with another geom"],
+)
+def test_variants_of_cubes_are_as_far_apart_as_their_own_sizes_ask(make_env, large, radius):
+    def edit(cfg):
+        for name in ("cube_0", "cube_1"):
+            cfg.scene.entities[name] = VariantEntityCfg(
+                variants={"small": get_cube_spec, "large": large},
+                assignment=lambda count: [index % 2 for index in range(count)],
+            )
+        del cfg.scene.entities["cube_2"]
+        command = cfg.commands["lift_height"]
+        command.entity_names = ("cube_0", "cube_1")
+        command.object_pose_range = PoseRange(x=(0.2, 0.5), y=(-0.3, 0.3))
+
+    env = make_env(MULTI, num_envs=100, images=False, edit=edit)
+    env.reset()
+    where = torch.stack([cube.data.root_link_pos_w for cube in lifting(env).objects])[..., :2]
+    gaps = (where[0] - where[1]).norm(dim=1)
+    small, large = gaps[0::2], gaps[1::2]
+    assert large.min() > 2.0 * radius - 1e-3
+    # Small ones are not kept further apart than they have to be.
+    assert DIAGONAL - 1e-3 < small.min() < 0.1
 
 
 # Which cube is wanted.

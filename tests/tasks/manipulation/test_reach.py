@@ -74,7 +74,9 @@ def test_what_is_beyond_the_reach_is_refused_when_the_environment_is_built(make_
         getattr(command, what).x = (0.3, 1.2)
 
     thing = "goals" if what.startswith("target") else "objects"
-    with pytest.raises(ValueError, match=f"(?s)'lift'.*puts {thing} as far away as .1.2,.*{what}"):
+    # The first term that names the goal and the hand says it.
+    term = "'lift'" if task == LIFT else "'actor/goal_position'"
+    with pytest.raises(ValueError, match=f"(?s){term}.*puts {thing} as far away as .1.2,.*{what}"):
         make_env(task, edit=edit, images=False)
 
 
@@ -84,3 +86,25 @@ def test_a_fixed_goal_is_in_reach_whatever_the_range_of_others(make_env):
         cfg.commands["lift_height"].target_position_range.x = (5.0, 6.0)
 
     make_env(edit=edit)
+
+
+def test_a_fixed_goal_that_the_arm_stands_too_far_from_is_refused(make_env):
+    def edit(cfg):
+        cfg.commands["lift_height"].difficulty = "fixed"
+        cfg.scene.entities["robot"].init_state.pos = (-1.0, 0.0, 0.01)
+
+    with pytest.raises(
+        ValueError, match=r"(?s)'lift'.*goals as far away as \(0.4, 0.0, 0.3\).*nearer"
+    ):
+        make_env(edit=edit)
+
+
+def test_a_goal_that_is_only_observed_is_refused_likewise(make_env):
+    def edit(cfg):
+        del cfg.rewards["lift"]
+        cfg.commands["lift_height"].target_position_range.x = (0.3, 1.2)
+
+    with pytest.raises(
+        ValueError, match="(?s)'actor/goal_position'.*puts goals as far away as .1.2,"
+    ):
+        make_env(MULTI, edit=edit, images=False)

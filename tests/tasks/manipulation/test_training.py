@@ -135,3 +135,17 @@ def test_a_goal_that_comes_just_before_the_end_costs_no_success(make_env):
         wrapped, put_at_goal, 3, success_func=lambda e: lifting(e).compute_success(), seed=0
     )
     assert literal.success_rate == 0.0
+
+
+def test_an_episode_that_is_cut_short_is_judged_by_the_goal_of_then(make_env):
+    env = make_env(num_envs=2)
+    env.reset()
+    term = lifting(env)
+    # Both met a goal, and have had another for a moment.
+    term.command_counter[:] = 2
+    term.last_goal_met[:], term.goal_age[:] = True, 0.0
+    term.metrics["position_error"][:] = 1.0
+    env.episode_length_buf[:] = torch.tensor([env.max_episode_length - 1, 500])
+    assert placed_at_goal(env).tolist() == [True, False]
+    term.metrics["position_error"][1] = 0.0
+    assert placed_at_goal(env).tolist() == [True, True]

@@ -38,6 +38,7 @@ def make_runner():
         task=G1,
         motion="squat,wave",
         actor=None,
+        distribution=None,
         edit=None,
         **kwargs,
     ) -> MotionTrackingOnPolicyRunner:
@@ -50,6 +51,7 @@ def make_runner():
         for model in ("actor", "critic"):
             cfg[model]["hidden_dims"] = (16,)
         cfg["actor"]["class_name"] = actor or cfg["actor"]["class_name"]
+        cfg["actor"]["distribution_cfg"] = distribution or cfg["actor"]["distribution_cfg"]
         cfg["logger"] = kwargs.pop("logger", "tensorboard")
         folder = None if log_dir is None else str(log_dir)
         return MotionTrackingOnPolicyRunner(RslRlVecEnvWrapper(env), cfg, folder, "cpu", **kwargs)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import onnxruntime
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 from tracking_tasks import G1, G1_BLIND
 
 from mjlab.envs import mdp
@@ -58,6 +60,9 @@ def test_what_is_learned_is_added_and_little_at_first(make_runner):
 def test_training_changes_what_is_learned_alone_and_checkpoints_keep_it(make_runner, tmp_path):
     runner = make_runner(tmp_path / "run", actor=ACTOR)
     actor = runner.alg.get_policy()
+    # Other values than a new runner has by itself, so that they have to come from the checkpoint.
+    actor.with_reference.weight.mul_(1.5)
+    actor.with_reference.bias.add_(0.25)
     weight = actor.with_reference.weight.clone()
     before = actor.with_reference.mlp[0].weight.detach().clone()
     runner.learn(2)
@@ -71,6 +76,13 @@ def test_training_changes_what_is_learned_alone_and_checkpoints_keep_it(make_run
     torch.testing.assert_close(policy(obs), actor(obs))
 
 
+def test_checkpoints_hold_what_is_learned_once(make_runner):
+    actor = make_runner(actor=ACTOR).alg.get_policy()
+    weights = [name for name in actor.state_dict() if name.endswith("weight")]
+    assert weights == ["mlp.weight", "mlp.mlp.0.weight", "mlp.mlp.2.weight"]
+    assert actor.with_reference is actor.mlp
+
+
 def test_the_export_asks_for_the_same(make_runner, tmp_path):
     runner = make_runner(tmp_path / "run", actor=ACTOR)
     runner.learn(2)
@@ -82,6 +94,40 @@ def test_the_export_asks_for_the_same(make_runner, tmp_path):
         inputs = {"obs": row[None].numpy(), "time_step": torch.zeros(1, 1).numpy()}
         exported = torch.from_numpy(session.run(["actions"], inputs)[0][0])
         torch.testing.assert_close(exported, expected, atol=1e-4, rtol=1e-4)
+
+
+def scale_by_one_number(cfg) -> None:
+    action = cfg.actions["joint_pos"]
+    action.scale, action.offset, action.use_default_offset = 0.5, 0.1, False
+
+
+class OneDevice(TorchDispatchMode):
+    """Refuses what a GPU refuses: operations other than copies on tensors of several devices."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        tensors = [leaf for leaf in tree_leaves(args) if isinstance(leaf, torch.Tensor)]
+        devices = {tensor.device.type for tensor in tensors}
+        assert len(devices) < 2 or "copy" in str(func), (func, devices)
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("edit", [None, scale_by_one_number])
+def test_actions_may_have_one_scale_and_offset_for_all_joints(make_runner, edit):
+    runner = make_runner(actor=ACTOR, edit=edit)
+    actor = runner.alg.get_policy()
+    forget_what_is_learned(actor)
+    obs = runner.env.get_observations()
+    torch.testing.assert_close(actor(obs), wanted_actions(runner), atol=1e-4, rtol=1e-4)
+    # The terms' numbers are brought to the networks' device, where that is another one.
+    actor.to("meta")
+    with OneDevice():
+        actor.follow(runner.env.unwrapped, runner.motion_command)
+
+
+@pytest.mark.parametrize("kind", ["HeteroscedasticGaussianDistribution", "BetaDistribution"])
+def test_distributions_that_take_more_than_the_mean_are_refused(make_runner, kind):
+    with pytest.raises(ValueError, match=f"{kind}.* Use 'GaussianDistribution'"):
+        make_runner(actor=ACTOR, distribution={"class_name": kind})
 
 
 def scale_command(cfg) -> None:

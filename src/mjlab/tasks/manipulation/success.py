@@ -10,12 +10,15 @@ _COMMAND = "lift_height"
 
 
 def placed_at_goal(env: Any) -> torch.Tensor:
-    """Return whether the object was brought to its goal, (num_envs,) bool.
+    """Return whether the object was at its goal, or, where time ran out on one too new, at the last.
 
-    That is asked at the end of an episode. Where a new goal came so shortly before that nobody
-    could have reached it, the goal before it counts; see `GoalCommand.goal_is_met`.
+    (num_envs,) bool. That is asked at the end of an episode. A goal is too new that came so shortly
+    before that nobody could have reached it; see `GoalCommand.goal_is_met`. Where it is not time that
+    ended the episode, the goal that there was then counts, however new.
     """
-    return _term(env).goal_is_met()
+    term = _term(env)
+    is_last_step = env.episode_length_buf >= env.max_episode_length - 1
+    return torch.where(is_last_step, term.goal_is_met(), term.compute_success())
 
 
 def position_error(env: Any) -> torch.Tensor:

@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mjlab.actuator import BuiltinPositionActuatorCfg
+from mjlab.asset_zoo.robots import get_yam_robot_cfg
 from mjlab.entity import EntityCfg
 from mjlab.envs.mdp import DifferentialIKActionCfg
 from mjlab.utils.damped_least_squares import damped_least_squares
@@ -60,6 +61,7 @@ ARM_XML = """
   </worldbody>
 </mujoco>
 """
+ENGINES = ("native", "warp")
 NUM_ENVS = 4
 HOME = (0.2, 1.0, 1.1, -0.4, 0.3, 0.5)
 MOTORS = BuiltinPositionActuatorCfg(target_names_expr=("j.*",), stiffness=100.0, damping=10.0)
@@ -213,7 +215,7 @@ def test_the_jacobian_is_that_of_finite_differences(arm: Any, kind: str, name: s
             )
 
 
-@pytest.mark.parametrize("engine", ["native", "warp"])
+@pytest.mark.parametrize("engine", ENGINES)
 def test_pose_and_jacobian_are_of_the_same_moment(make_world: Any, engine: str) -> None:
     arm = make_arm(make_world, engine=engine)
     ik = term(arm)
@@ -229,7 +231,7 @@ def test_pose_and_jacobian_are_of_the_same_moment(make_world: Any, engine: str) 
 
 def test_both_engines_command_the_same_targets(make_world: Any) -> None:
     targets = []
-    for engine in ("native", "warp"):
+    for engine in ENGINES:
         arm = make_arm(make_world, engine=engine)
         ik = term(arm, actuator_names=("j[1-5]",), joint_limit_weight=0.3, posture_weight=0.1)
         act(ik, [0.1, -0.05, 0.05, 0.3, 0.0, 0.2])
@@ -285,7 +287,11 @@ def mink_dq(ik: Any, arm: Any, env: int, task: type, limited: bool = False) -> t
     outside = mink.PostureTask(model, cost=cfg.joint_limit_weight * (nearest != q))
     outside.set_target(nearest)
     posture = mink.PostureTask(model, cost=cfg.posture_weight)
-    posture.set_target(ik._posture[env].double().numpy())
+    wanted_q = q.copy()
+    wanted_q[ik._columns] = ik._posture[env].double().numpy()
+    posture.set_target(wanted_q)
+    # Joints that are not controlled stand still.
+    frozen = sorted(set(range(model.nv)) - set(np.arange(model.nv)[ik._dofs].tolist()))
     limits = []
     if limited:
         own = mujoco.MjModel.from_xml_string(ARM_XML)
@@ -298,8 +304,9 @@ def mink_dq(ik: Any, arm: Any, env: int, task: type, limited: bool = False) -> t
         solver="daqp",
         damping=cfg.damping**2,
         limits=limits,
+        constraints=[mink.DofFreezingTask(model, frozen)] if frozen else None,
     )
-    return torch.from_numpy(velocity).float()
+    return torch.from_numpy(velocity).float()[ik._dofs]
 
 
 COSTS: tuple[dict[str, float], ...] = (
@@ -343,6 +350,42 @@ def test_small_steps_are_those_of_minks_own_frame_task(arm: Any) -> None:
         differences.append(((found - expected).norm() / expected.norm()).item())
     assert differences[0] < 0.1
     assert differences[1] < 0.12 * differences[0]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("names", [(".*",), ("joint.*",)], ids=["with the gripper", "arm"])
+def test_a_step_of_the_yam_is_that_of_mink_and_its_fingers_stay_coupled(
+    world_of: Any, engine: str, names: tuple[str, ...]
+) -> None:
+    yam = world_of(get_yam_robot_cfg(), num_envs=2, engine=engine)
+    yam.sim.data.qpos[:] = yam.robot.data.default_joint_pos
+    yam.sim.data.qpos[1, :6] += 0.1
+    yam.robot.data.joint_pos_target[:] = yam.sim.data.qpos
+    yam.sim.forward()
+    # A posture with the gripper wider open than it is.
+    posture = {"left_finger": 0.03} if names == (".*",) else None
+    ik = term(
+        yam, names, frame_name="grasp_site", posture_weight=0.1, posture_target=posture, max_dq=9.0
+    )
+    act(ik, [0.04, -0.03, 0.02, 0.2, -0.1, 0.1])
+    found = ik.compute_dq()
+    # The motor of the gripper is at the left finger; an equality moves the right one.
+    assert found.shape == (2, 7 if posture else 6)
+    for env in range(2):
+        expected = mink_dq(ik, yam, env, SeparateErrors)
+        torch.testing.assert_close(found[env], expected, atol=2e-5, rtol=1e-3)
+    assert found[:, :6].abs().max() > 0.02
+    left, right = (yam.robot.joint_names.index(f"{side}_finger") for side in ("left", "right"))
+    before = yam.sim.data.qpos[:, left].clone()
+    for _ in range(50):
+        ik.apply_actions()
+        yam.robot.write_data_to_sim()
+        yam.sim.step(1)
+    opening = yam.sim.data.qpos[:, left] - before
+    assert (opening > 1e-3).all() if posture else (opening.abs() < 1e-3).all()
+    torch.testing.assert_close(
+        yam.sim.data.qpos[:, left], -yam.sim.data.qpos[:, right], atol=1e-3, rtol=0.0
+    )
 
 
 def test_a_joint_at_its_limit_stops_and_the_others_make_up_for_it_as_in_mink(arm: Any) -> None:
@@ -460,8 +503,11 @@ def test_the_largest_numbers_overflow_nothing(arm: Any, fields: Any, size: float
     assert dq.abs().max() <= 0.5
 
 
-def test_an_unreachable_target_is_approached_in_the_simulation(make_world: Any) -> None:
-    arm = make_arm(make_world, num_envs=8)
+@pytest.mark.parametrize("engine", ENGINES)
+def test_an_unreachable_target_is_approached_in_the_simulation(
+    make_world: Any, engine: str
+) -> None:
+    arm = make_arm(make_world, num_envs=8, engine=engine)
     ik = term(arm, orientation_weight=0.0, use_relative_mode=False)
     targets = 3.0 * torch.nn.functional.normalize(torch.randn(8, 3), dim=1)
     ik.process_actions(targets)

@@ -102,6 +102,13 @@ def randomize(
     return written
 
 
+def targets_of(
+    env: ManagerBasedRlEnv, ranges: Any, asset_cfg: SceneEntityCfg, kind: ObjectKind
+) -> list[Selection]:
+    """Return what `randomize` would write with these `ranges`, in all environments."""
+    return [select(env, None, asset_cfg, kind, pattern) for pattern, _ in _by_pattern(ranges)]
+
+
 def rotate(
     row: FieldRow,
     env: ManagerBasedRlEnv,

@@ -47,6 +47,24 @@ def require_primitive_geoms(selection: Selection) -> None:
         )
 
 
+def require_fovy_cameras(selection: Selection) -> None:
+    """Raise `ValueError` if a selected camera has a sensor, because of which fovy is not read."""
+    model = selection.env.sim.mj_model
+    # Parallel rays have no focal length: there fovy is the height of the image.
+    refused = [
+        name
+        for name, camera in zip(selection.names, selection.columns.tolist(), strict=True)
+        if model.cam_sensorsize[camera, 1] > 0.0
+        and model.cam_projection[camera] == mujoco.mjtProjection.mjPROJ_PERSPECTIVE
+    ]
+    if refused:
+        raise ValueError(
+            f"cam_fovy: these cameras have a focal length and a sensor size, so that their field "
+            f"of view is not read: {refused}. Use dr.cam_intrinsic for them, or select others "
+            "(camera_names of the SceneEntityCfg)."
+        )
+
+
 def refresh_geom_bounds(selection: Selection) -> None:
     """Recompute bounding sphere radius and box of the selected geoms from their sizes."""
     env = selection.env

@@ -179,7 +179,13 @@ _CAMERAS = (
         "Perturb camera orientations in the body frame.",
         rotation=True,
     ),
-    FieldRow("cam_fovy", "cam_fovy", CAMERA, "Randomize vertical fields of view (degrees)."),
+    FieldRow(
+        "cam_fovy",
+        "cam_fovy",
+        CAMERA,
+        "Randomize vertical fields of view (degrees). Cameras with a focal length and a sensor "
+        "size do not read it, and are refused when the term is built: see `cam_intrinsic`.",
+    ),
     FieldRow(
         "cam_intrinsic",
         "cam_intrinsic",

@@ -84,7 +84,7 @@ class MultiCubeLiftingCommand(GoalCommand):
         self.target_selection = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self._geom_ids = _padded_geom_ids(self.objects).to(self.device)
         self._apart = distance_apart(
-            env.sim.mj_model, self._geom_ids, cfg.object_pose_range, cfg.entity_names
+            env.sim, self._geom_ids, cfg.object_pose_range, cfg.entity_names
         )
 
     @property
@@ -114,7 +114,7 @@ class MultiCubeLiftingCommand(GoalCommand):
             positions.append(uniform_in(count, within.x, within.y, within.z, device=self.device))
             yaws.append(uniform_in(count, within.yaw, device=self.device).squeeze(1))
         placed = torch.stack(positions, dim=1)
-        keep_apart(placed, self._apart, within.x, within.y)
+        keep_apart(placed, self._apart[env_ids], within.x, within.y)
         for index, entity in enumerate(self.objects):
             self._place(entity, placed[:, index], yaws[index], env_ids)
 

@@ -31,6 +31,7 @@ from mjlab.tasks.manipulation.mdp.camera_observations import (
 from mjlab.tasks.manipulation.mdp.camera_observations import (
     camera_target_cube_mask as camera_target_cube_mask,
 )
+from mjlab.tasks.manipulation.mdp.reach import check_reach
 from mjlab.utils.lab_api.math import quat_apply_inverse
 
 if TYPE_CHECKING:
@@ -97,8 +98,8 @@ def _check_target_position(
     **_: Any,
 ) -> None:
     require_command(env, command_name)
-    goal_command(env, command_name)
-    check_site(env, asset_cfg)
+    command = goal_command(env, command_name)
+    check_reach(env, command_name, command.cfg, asset_cfg.name, check_site(env, asset_cfg))
 
 
 @checked_when_built(_check_target_position)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 if TYPE_CHECKING:
-    import mujoco
+    from mjlab.sim import Simulation
 
 logger = logging.getLogger(__name__)
 
@@ -33,10 +33,11 @@ def keep_apart(
 
     Args:
         positions: (n, K, 3) positions of K objects.
-        apart: (K, K) least horizontal distances, in metres.
+        apart: (n, K, K) or (K, K) least horizontal distances, in metres.
         x: Range of new x.
         y: Range of new y.
     """
+    apart = apart.expand(len(positions), -1, -1)
     for index in range(1, positions.shape[1]):
         close = _too_close(positions, index, apart)
         for _ in range(_MAX_TRIES):
@@ -46,38 +47,41 @@ def keep_apart(
             drawn = torch.rand(len(rows), 2, device=positions.device)
             positions[rows, index, 0] = drawn[:, 0] * (x[1] - x[0]) + x[0]
             positions[rows, index, 1] = drawn[:, 1] * (y[1] - y[0]) + y[0]
-            close[rows] = _too_close(positions[rows], index, apart)
+            close[rows] = _too_close(positions[rows], index, apart[rows])
 
 
 def _too_close(positions: torch.Tensor, index: int, apart: torch.Tensor) -> torch.Tensor:
     """Return whether an object is too close to one of those before it, (n,) bool."""
     offsets = positions[:, :index, :2] - positions[:, index : index + 1, :2]
     distances = torch.linalg.vector_norm(offsets, dim=-1)
-    return (distances < apart[index, :index]).any(dim=1)
+    return (distances < apart[:, index, :index]).any(dim=1)
 
 
 def distance_apart(
-    model: mujoco.MjModel, geom_ids: torch.Tensor, within: Any, names: Sequence[str]
+    sim: Simulation, geom_ids: torch.Tensor, within: Any, names: Sequence[str]
 ) -> torch.Tensor:
-    """Return how far apart the origins of objects have to be not to touch, (K, K) in metres.
+    """Return how far apart the origins of objects have to be not to touch, (N, K, K) in metres.
 
     That is the sum of the radii of the spheres about their origins that hold them: for two equal
-    cubes, the diagonal of one. Warns if the range `within` is too small for all of them.
+    cubes, the diagonal of one. Variants of objects have radii of their own. Warns if the range
+    `within` is too small for all of them in any environment.
 
     Args:
-        model: The compiled scene.
+        sim: The simulation of the scene.
         geom_ids: (K, G) scene ids of each object's geoms; negative ones are no geom.
         within: Ranges `x` and `y` that the objects are placed in.
         names: The objects' names.
     """
-    radii = torch.zeros(len(geom_ids), device=geom_ids.device)
-    for row, ids in enumerate(geom_ids.tolist()):
-        for geom in [geom for geom in ids if geom >= 0]:
-            # As these objects have one body, a geom's position is that from the origin.
-            reach = math.hypot(*model.geom_pos[geom]) + float(model.geom_rbound[geom])
-            radii[row] = max(float(radii[row]), reach)
-    _warn_if_crowded(radii.tolist(), within, names)
-    return radii.unsqueeze(0) + radii.unsqueeze(1)
+    # As these objects have one body, a geom's position is that from the origin.
+    reach = sim.model.geom_pos.norm(dim=-1) + sim.model.geom_rbound
+    if sim.absent_geoms is not None:
+        reach = reach.masked_fill(sim.absent_geoms, 0.0)
+    radii = reach.new_zeros(len(reach), len(geom_ids))
+    for ids in geom_ids.T:
+        radii = torch.maximum(radii, torch.where(ids >= 0, reach[:, ids.clamp(min=0)], 0.0))
+    largest = int(radii.square().sum(dim=1).argmax())
+    _warn_if_crowded(radii[largest].tolist(), within, names)
+    return radii.unsqueeze(1) + radii.unsqueeze(2)
 
 
 def _warn_if_crowded(radii: list[float], within: Any, names: Sequence[str]) -> None:

@@ -71,13 +71,20 @@ def check_reach(
         farthest = max(points, key=lambda point: math.dist(point, center))
         distance = math.dist(farthest, center)
         if distance > longest + cfg.success_threshold:
-            field = "target_position_range" if label == "goals" else "object_pose_range"
+            remedy = _remedy(cfg, label)
             raise ValueError(
                 f"The command {command_name!r} puts {label} as far away as {farthest} (metres from "
                 f"the environment's origin). That is {distance:.2f} m from the first joint of entity "
-                f"{entity_name!r}, whose site {site!r} gets {longest:.2f} m from it at most. Narrow "
-                f"{field} to what the arm can reach."
+                f"{entity_name!r}, whose site {site!r} gets {longest:.2f} m from it at most. "
+                f"{remedy}"
             )
+
+
+def _remedy(cfg: GoalCommandCfg, label: str) -> str:
+    if label == "goals" and cfg.difficulty == "fixed":
+        return "Put the arm nearer, or choose the difficulty 'dynamic', whose goals have a range."
+    field = "target_position_range" if label == "goals" else "object_pose_range"
+    return f"Narrow {field} to what the arm can reach."
 
 
 def _goals(cfg: GoalCommandCfg) -> list[tuple[float, ...]]:

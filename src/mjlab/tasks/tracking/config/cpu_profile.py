@@ -22,19 +22,19 @@ from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.managers.curriculum_manager import CurriculumTermCfg
 from mjlab.rl.config import RslRlOnPolicyRunnerCfg, gaussian_distribution
 from mjlab.tasks.easing import (
-    Undo,
+    Easing,
     coarsen_physics,
+    drop_easing,
     ease_pushes,
     ease_weight,
-    part_of,
     undo_all,
 )
 from mjlab.tasks.tracking.evaluation import play_motions_once
-from mjlab.tasks.tracking.mdp import MotionCommandCfg
 from mjlab.tasks.tracking.mdp._shared import motion_command
 
-_COMMAND, _EASED_STARTS = "motion", "eased_starts"
+_COMMAND = "motion"
 _ACTION_RATE = "action_rate_l2"
+# By which samples become the steps that curricula count; more environments are eased for as many steps.
 _NUM_ENVS = 512
 _ACTION_RATE_AT_FIRST = 0.05
 _ACTION_RATE_SAMPLES = 6_000_000
@@ -45,15 +45,15 @@ _UNPUSHED_SAMPLES = 12_000_000
 def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     """Edit the configs of a tracking task in place."""
     env_cfg.scene.num_envs = _NUM_ENVS
-    weight = env_cfg.rewards[_ACTION_RATE]
-    first = 0.0 if weight is None else _ACTION_RATE_AT_FIRST * weight.weight
-    undos = [
-        coarsen_physics(env_cfg),
-        ease_weight(env_cfg, _ACTION_RATE, first, _ACTION_RATE_SAMPLES // _NUM_ENVS),
-        ease_pushes(env_cfg, _UNPUSHED_SAMPLES // _NUM_ENVS),
-        _ease_starts(env_cfg, _CALM_SAMPLES // _NUM_ENVS),
-    ]
-    rl_cfg.evaluation.prepare_env = undo_all([*undos, play_motions_once])
+    undos = [drop_easing, coarsen_physics(env_cfg), play_motions_once]
+    rl_cfg.evaluation.prepare_env = undo_all(undos)
+    penalty = env_cfg.rewards[_ACTION_RATE]
+    if penalty is not None:
+        first = _ACTION_RATE_AT_FIRST * penalty.weight
+        ease_weight(env_cfg, _ACTION_RATE, first, _ACTION_RATE_SAMPLES // _NUM_ENVS)
+    ease_pushes(env_cfg, _UNPUSHED_SAMPLES // _NUM_ENVS)
+    params = {"command_name": _COMMAND, "steps": _CALM_SAMPLES // _NUM_ENVS}
+    env_cfg.curriculum["eased_starts"] = CurriculumTermCfg(func=GrowingStarts, params=params)
     _learn_from_few_samples(rl_cfg)
     evaluation = rl_cfg.evaluation
     evaluation.num_episodes = 200
@@ -62,49 +62,21 @@ def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     evaluation.solved_above = {"success_rate": 0.9}
 
 
-def _ease_starts(env_cfg: ManagerBasedRlEnvCfg, steps: int) -> Undo:
-    motion = env_cfg.commands[_COMMAND]
-    assert isinstance(motion, MotionCommandCfg)
-    full = {
-        "pose_range": motion.pose_range,
-        "velocity_range": motion.velocity_range,
-        "joint_position_range": motion.joint_position_range,
-    }
-    env_cfg.curriculum[_EASED_STARTS] = CurriculumTermCfg(
-        func=growing_starts, params={"command_name": _COMMAND, "steps": steps, **full}
-    )
+class GrowingStarts(Easing):
+    """Lets the perturbation of starts grow from nothing to what the command's config says.
 
-    def undo(eased: ManagerBasedRlEnvCfg) -> None:
-        command = eased.commands.get(_COMMAND)
-        growing = eased.curriculum.pop(_EASED_STARTS, None)
-        if command is not None and growing is not None:
-            # Those of a training under way are as large as they have grown by then.
-            for name in full:
-                setattr(command, name, growing.params[name])
-
-    return undo
-
-
-def growing_starts(
-    env: ManagerBasedRlEnv,
-    env_ids: torch.Tensor | slice,
-    command_name: str,
-    pose_range: dict[str, tuple[float, float]],
-    velocity_range: dict[str, tuple[float, float]],
-    joint_position_range: tuple[float, float],
-    steps: int,
-) -> float:
-    """Let perturbations of starts grow from nothing to these ranges over `steps` environment steps.
-
-    Returns the fraction that they have reached, for logging.
+    Returns the fraction that it has reached.
     """
-    fraction = min(env.common_step_counter / steps, 1.0)
-    motion = motion_command(env, command_name).cfg
-    motion.pose_range = part_of(pose_range, fraction)
-    motion.velocity_range = part_of(velocity_range, fraction)
-    low, high = joint_position_range
-    motion.joint_position_range = (fraction * low, fraction * high)
-    return fraction
+
+    def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
+        super().__init__(env)
+
+    def __call__(
+        self, env: ManagerBasedRlEnv, env_ids: torch.Tensor | slice, command_name: str, steps: int
+    ) -> float:
+        command = motion_command(env, command_name)
+        command.start_perturbation = self.fraction(steps)
+        return command.start_perturbation
 
 
 def _learn_from_few_samples(rl_cfg: RslRlOnPolicyRunnerCfg) -> None:

@@ -104,6 +104,7 @@ class MotionCommand(MotionReader, CommandTerm):
         time_steps: (N,) int64, its frame t within that motion.
         body_pos_relative_w: (N, K, 3) relative positions; `body_quat_relative_w` (N, K, 4).
         sampler: The statistics of failures; None unless sampling is adaptive.
+        start_perturbation: How much of the config's perturbation starts get, from 0 to 1.
         drawing: How the reference is drawn.
     """
 
@@ -141,6 +142,7 @@ class MotionCommand(MotionReader, CommandTerm):
         sampler = self._make_sampler()
         self._num_bins = sampler.num_bins
         self.sampler = sampler if cfg.sampling_mode == "adaptive" else None
+        self.start_perturbation = 1.0
         # How often each environment was started, so that it plays one motion after the other.
         self._num_starts = torch.zeros_like(self.time_steps)
         # The step in which a failure was last counted, so that none is counted twice.
@@ -251,9 +253,10 @@ class MotionCommand(MotionReader, CommandTerm):
         root_state, joint_pos = perturbed_start(
             self.motion,
             at,
-            pose_range=cfg.pose_range if perturbed else {},
-            velocity_range=cfg.velocity_range if perturbed else {},
-            joint_position_range=cfg.joint_position_range if perturbed else (0.0, 0.0),
+            pose_range=cfg.pose_range,
+            velocity_range=cfg.velocity_range,
+            joint_position_range=cfg.joint_position_range,
+            scale=self.start_perturbation if perturbed else 0.0,
         )
         root_state[:, :3] += self.scene.env_origins[env_ids]
         limits = robot.data.soft_joint_pos_limits[env_ids]

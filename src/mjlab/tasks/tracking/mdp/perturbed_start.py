@@ -23,12 +23,13 @@ def perturbed_start(
     pose_range: Mapping[str, tuple[float, float]],
     velocity_range: Mapping[str, tuple[float, float]],
     joint_position_range: tuple[float, float],
+    scale: float = 1.0,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return states on frames (n,), with uniform perturbations.
 
     Positions and velocities are added to, p + (x, y, z) and v + (x, y, z), w + (roll, pitch, yaw);
     orientations are turned in world axes, q_euler(roll, pitch, yaw) q. Numbers are drawn in the
-    order pose, velocity, joints. The root is the first of the tracked bodies.
+    order pose, velocity, joints, and multiplied by `scale`. The root is the first of the tracked bodies.
 
     Returns:
         Root states (n, 13), without origins of environments, and joint positions (n, nj).
@@ -37,10 +38,10 @@ def perturbed_start(
     pos, quat = motion.body_pos_w[frames, 0], motion.body_quat_w[frames, 0]
     lin_vel, ang_vel = motion.body_lin_vel_w[frames, 0], motion.body_ang_vel_w[frames, 0]
     joint_pos = motion.joint_pos[frames]
-    pose = _drawn(pose_range, count, device)
+    pose = scale * _drawn(pose_range, count, device)
     turn = quat_from_euler_xyz(*pose[:, 3:].unbind(1))
-    velocity = _drawn(velocity_range, count, device)
-    joints = sample_uniform(*joint_position_range, tuple(joint_pos.shape), device)
+    velocity = scale * _drawn(velocity_range, count, device)
+    joints = scale * sample_uniform(*joint_position_range, tuple(joint_pos.shape), device)
     root_state = torch.cat(
         (
             pos + pose[:, :3],

@@ -23,10 +23,26 @@ class ReferenceActor(MLPModel):
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        """Take the arguments of rsl_rl's `MLPModel`."""
+        """Take the arguments of rsl_rl's `MLPModel`.
+
+        Raises:
+            ValueError: the distribution takes more from the network than one number for each action.
+        """
         super().__init__(*args, **kwargs)
-        self.with_reference = _WithReference(self.mlp, self.obs_normalizer, self.obs_dim)
-        self.mlp: nn.Module = self.with_reference
+        wanted = self.distribution
+        if wanted is not None and wanted.input_dim != wanted.output_dim:
+            raise ValueError(
+                f"ReferenceActor cannot have the distribution {type(wanted).__name__}, which takes "
+                f"{wanted.input_dim} numbers from the network for {wanted.output_dim} actions. Use "
+                "'GaussianDistribution', which takes the mean alone, or class_name='MLPModel'."
+            )
+        self.mlp: nn.Module = _WithReference(self.mlp, self.obs_normalizer, self.obs_dim)
+
+    @property
+    def with_reference(self) -> _WithReference:
+        """The network and what is added to its output; it stands where `MLPModel` has the network."""
+        network: Any = self.mlp
+        return network
 
     def follow(self, env: Any, command: MotionCommand) -> None:
         """Take from `env` which action asks for which joint of `command`.
@@ -38,12 +54,17 @@ class ReferenceActor(MLPModel):
         begin = _place_of_command(env, self.obs_groups, command)
         names = command.robot.joint_names
         term = _joint_positions(env)
-        columns = [begin + names.index(name) for name in term.target_names]
-        shape = (env.num_envs, len(columns))
-        scale = torch.as_tensor(term.scale).expand(shape)[0]
-        offset = torch.as_tensor(term.offset).expand(shape)[0]
-        self.with_reference.weight[torch.arange(len(columns)), torch.tensor(columns)] = 1.0 / scale
-        self.with_reference.bias.copy_(-offset / scale)
+        weight, bias = self.with_reference.weight, self.with_reference.bias
+        device, indices = weight.device, [names.index(name) for name in term.target_names]
+        columns = begin + torch.tensor(indices, device=device)
+        rows = torch.arange(len(indices), device=device)
+        # Both may be single numbers, and the networks may be on another device than the term.
+        shape = (env.num_envs, len(indices))
+        scale = torch.as_tensor(term.scale, device=device).expand(shape)[0]
+        offset = torch.as_tensor(term.offset, device=device).expand(shape)[0]
+        with torch.no_grad():
+            weight[rows, columns] = 1.0 / scale
+            bias.copy_(-offset / scale)
 
 
 class _WithReference(nn.Module):
@@ -55,6 +76,8 @@ class _WithReference(nn.Module):
 
     def __init__(self, mlp: Any, normalizer: nn.Module, num_observations: int) -> None:
         super().__init__()
+        # The normalizer is the model's. It is listed here too, so that a copy of this module alone,
+        # which is what is exported, has it and moves it to other devices.
         self.mlp, self.normalizer = mlp, normalizer
         last = [layer for layer in mlp if isinstance(layer, nn.Linear)][-1]
         with torch.no_grad():

@@ -21,10 +21,11 @@ from __future__ import annotations
 
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import RslRlOnPolicyRunnerCfg, gaussian_distribution
-from mjlab.tasks.easing import Undo, ease_pushes, ease_weight, undo_all
+from mjlab.tasks.easing import drop_easing, ease_pushes, ease_weight, undo_all
 from mjlab.tasks.simple_contacts import simplify_contacts
 
 _AIR_TIME = "air_time"
+# By which samples become the steps that curricula count; more environments are eased for as many steps.
 _NUM_ENVS = 512
 _PENALTY_AT_FIRST = 0.02
 _AIR_TIME_AT_FIRST = 0.5
@@ -38,9 +39,9 @@ _UNPUSHED_SAMPLES = 2_000_000
 def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     """Edit the configs of a velocity task in place."""
     env_cfg.scene.num_envs = _NUM_ENVS
-    undos = [simplify_contacts(env_cfg), *_ease_rewards(env_cfg)]
-    undos.append(ease_pushes(env_cfg, _UNPUSHED_SAMPLES // _NUM_ENVS))
-    rl_cfg.evaluation.prepare_env = undo_all(undos)
+    rl_cfg.evaluation.prepare_env = undo_all([drop_easing, simplify_contacts(env_cfg)])
+    _ease_rewards(env_cfg)
+    ease_pushes(env_cfg, _UNPUSHED_SAMPLES // _NUM_ENVS)
     _learn_from_few_samples(rl_cfg)
     evaluation = rl_cfg.evaluation
     evaluation.num_episodes = 200
@@ -66,15 +67,13 @@ def cpu_humanoid(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) 
     evaluation.solved_below = {"lin_vel_error": 0.4, "failure_rate": 0.2}
 
 
-def _ease_rewards(env_cfg: ManagerBasedRlEnvCfg) -> list[Undo]:
-    undos = []
-    for name, term in list(env_cfg.rewards.items()):
+def _ease_rewards(env_cfg: ManagerBasedRlEnvCfg) -> None:
+    for name, term in env_cfg.rewards.items():
         if term is None or (term.weight >= 0 and name != _AIR_TIME):
             continue
         first = _AIR_TIME_AT_FIRST if name == _AIR_TIME else _PENALTY_AT_FIRST * term.weight
         samples = _LIFTING_EASED_SAMPLES if name in _LIFTING else _EASED_SAMPLES
-        undos.append(ease_weight(env_cfg, name, first, samples // _NUM_ENVS))
-    return undos
+        ease_weight(env_cfg, name, first, samples // _NUM_ENVS)
 
 
 def _learn_from_few_samples(rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
