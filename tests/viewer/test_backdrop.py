@@ -57,6 +57,31 @@ def test_the_sky_is_painted_where_there_is_nothing_and_meets_the_haze() -> None:
     assert after[0, 0].sum() > after[last, 0].sum()
 
 
+def test_what_is_seen_through_stays_before_the_sky() -> None:
+    ghost = '<geom name="ghost" type="sphere" size=".4" pos="0 0 1.6" rgba="0 1 0 .5"/>'
+    scene = mujoco.MjModel.from_xml_string(
+        XML.format(assets="").replace("<camera", f"{ghost}<camera")
+    )
+    data = mujoco.MjData(scene)
+    mujoco.mj_forward(scene, data)
+    try:
+        renderer = open_renderer(scene, 60, 60)
+    except RenderingUnavailableError as error:
+        pytest.skip(str(error))
+    with renderer:
+        renderer.update_scene(data, camera="side")
+        pixels = renderer.render()
+        before = pixels.copy()
+        paint_sky(pixels, renderer)
+    red, green, blue = pixels[18, 30].astype(int)
+    # It is drawn over black.
+    assert before[18, 30, 1] > 30
+    assert before[18, 30, ::2].max() < 5
+    # Greener than the sky beside it, which shines through.
+    assert green - blue > pixels[18, 2].astype(int)[1] - pixels[18, 2].astype(int)[2] + 20
+    assert 0 < red < pixels[18, 2, 0]
+
+
 def test_several_directional_lights_are_as_bright_as_one_and_cast_one_shadow() -> None:
     scene = model()
     prepare_sun(scene, distance=4.0)

@@ -38,7 +38,12 @@ def paint_sky(pixels: np.ndarray, renderer: mujoco.Renderer) -> None:
     colors = (1.0 - share) * np.array(_ZENITH) + share * horizon
     sky = np.zeros((len(pixels), 1, 3), dtype=np.uint8)
     sky[: rows[-1] + 1, 0] = np.round(255.0 * colors)
-    np.copyto(pixels, sky, where=nothing[:, :, None])
+    # See-through shapes, such as ghosts, are drawn over black, and are not in the depths. How much of
+    # what is behind they let through is not known any more; half is what ghosts do.
+    through = nothing & pixels.any(axis=2)
+    tinted = np.minimum(pixels.astype(np.uint16) + sky // 2, 255)
+    np.copyto(pixels, sky, where=(nothing & ~through)[:, :, None])
+    np.copyto(pixels, tinted.astype(np.uint8), where=through[:, :, None])
 
 
 def prepare_sun(model: mujoco.MjModel, distance: float) -> None:
