@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.utils.lab_api.math import quat_apply, quat_inv, quat_mul, yaw_quat
+from mjlab.utils.lab_api.math import quat_inv, quat_mul, yaw_quat
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -162,17 +162,31 @@ class MotionReader:
         Returns:
             Positions (n, K, 3) and orientations (n, K, 4).
         """
-        body_pos, body_quat = self.body_pos_w, self.body_quat_w
-        robot_pos, robot_quat = self.robot_anchor_pos_w, self.robot_anchor_quat_w
-        if env_ids is not None:
-            body_pos, body_quat = body_pos[env_ids], body_quat[env_ids]
-            robot_pos, robot_quat = robot_pos[env_ids], robot_quat[env_ids]
+        rows: Any = slice(None) if env_ids is None else env_ids
+        frames = self.frame_indexes[rows]
+        # Origins of environments cancel out.
+        body_pos, body_quat = self.motion.body_pos_w[frames], self.motion.body_quat_w[frames]
+        origins_z = self.scene.env_origins[rows, 2]
+        robot_pos, robot_quat = self.robot_anchor_pos_w[rows], self.robot_anchor_quat_w[rows]
         anchor_pos, anchor_quat = body_pos[:, self.anchor_index], body_quat[:, self.anchor_index]
         turn = yaw_quat(quat_mul(robot_quat, quat_inv(anchor_quat)))
-        turn = turn[:, None].expand(-1, body_pos.shape[1], -1)
-        place = torch.cat((robot_pos[:, :2], anchor_pos[:, 2:]), dim=1)
-        pos = quat_apply(turn, body_pos - anchor_pos[:, None]).add_(place[:, None])
-        return pos, quat_mul(turn, body_quat)
+        w, z = turn[:, :1], turn[:, 3:]
+        # Written out, because a turn about z takes half of what any other takes.
+        cos, sin = w * w - z * z, 2.0 * w * z
+        x, y = (body_pos - anchor_pos[:, None]).unbind(-1)[:2]
+        pos = torch.stack(
+            (
+                cos * x - sin * y + robot_pos[:, :1],
+                sin * x + cos * y + robot_pos[:, 1:2],
+                body_pos[..., 2] + origins_z[:, None],
+            ),
+            dim=-1,
+        )
+        qw, qx, qy, qz = body_quat.unbind(-1)
+        quat = torch.stack(
+            (w * qw - z * qz, w * qx - z * qy, w * qy + z * qx, w * qz + z * qw), dim=-1
+        )
+        return pos, quat
 
 
 class MotionFrame(MotionReader):

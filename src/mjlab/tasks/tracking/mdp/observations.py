@@ -8,7 +8,7 @@ import torch
 
 from mjlab.managers.build_checks import checked_when_built
 from mjlab.tasks.tracking.mdp._shared import check_motion_term, motion_command
-from mjlab.utils.lab_api.math import matrix_from_quat, quat_apply_inverse, quat_inv, quat_mul
+from mjlab.utils.lab_api.math import quat_apply_inverse, quat_inv, quat_mul
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -55,4 +55,9 @@ def robot_body_ori_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
 
 
 def _two_columns(quat: torch.Tensor) -> torch.Tensor:
-    return matrix_from_quat(quat)[..., :2].flatten(-2)
+    """Return the first two columns of rotation matrices of unit quaternions, row by row, (..., 6)."""
+    w, x, y, z = quat.unbind(-1)
+    xy, wz, xz, wy, yz, wx = x * y, w * z, x * z, w * y, y * z, w * x
+    yy, xx, zz = y * y, x * x, z * z
+    rows = (0.5 - yy - zz, xy - wz, xy + wz, 0.5 - xx - zz, xz - wy, yz + wx)
+    return torch.stack(rows, dim=-1).mul_(2.0)
