@@ -30,17 +30,12 @@ def model(assets: str = "") -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(XML.format(assets=assets))
 
 
-def test_a_model_with_a_sky_keeps_it() -> None:
-    assert has_sky(model(SKY))
-    assert not has_sky(model())
-
-
-def test_the_sky_is_painted_where_there_is_nothing_and_meets_the_haze() -> None:
-    scene = model()
+def painted(scene: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Return the image that the camera sees, 60 x 60, before and after the sky is painted."""
     data = mujoco.MjData(scene)
     mujoco.mj_forward(scene, data)
     try:
-        renderer = open_renderer(scene, 40, 60)
+        renderer = open_renderer(scene, 60, 60)
     except RenderingUnavailableError as error:
         pytest.skip(str(error))
     with renderer:
@@ -48,6 +43,17 @@ def test_the_sky_is_painted_where_there_is_nothing_and_meets_the_haze() -> None:
         before = renderer.render()
         after = before.copy()
         paint_sky(after, renderer)
+    return before, after
+
+
+def test_a_model_with_a_sky_keeps_it() -> None:
+    assert has_sky(model(SKY))
+    assert not has_sky(model())
+
+
+def test_the_sky_is_painted_where_there_is_nothing_and_meets_the_haze() -> None:
+    scene = model()
+    before, after = painted(scene)
     ground = before[..., 0] > 0
     assert 0 < ground.sum() < ground.size
     np.testing.assert_array_equal(after[ground], before[ground])
@@ -62,17 +68,7 @@ def test_what_is_seen_through_stays_before_the_sky() -> None:
     scene = mujoco.MjModel.from_xml_string(
         XML.format(assets="").replace("<camera", f"{ghost}<camera")
     )
-    data = mujoco.MjData(scene)
-    mujoco.mj_forward(scene, data)
-    try:
-        renderer = open_renderer(scene, 60, 60)
-    except RenderingUnavailableError as error:
-        pytest.skip(str(error))
-    with renderer:
-        renderer.update_scene(data, camera="side")
-        pixels = renderer.render()
-        before = pixels.copy()
-        paint_sky(pixels, renderer)
+    before, pixels = painted(scene)
     red, green, blue = pixels[18, 30].astype(int)
     # It is drawn over black.
     assert before[18, 30, 1] > 30
