@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cameras
+import engines_agree
 import learning
 import live_view
 import reach
@@ -17,7 +18,7 @@ from report import RESULTS, Row, show, write
 def main() -> None:
     rows: list[Row] = []
     quick = (throughput, tasks, cameras, reach, startup, repeatability)
-    for benchmark in (*quick, learning, live_view, walking):
+    for benchmark in (*quick, learning, live_view, walking, engines_agree):
         print(f"{benchmark.__name__} ...", flush=True)
         rows += benchmark.measure()
         # Written after each, so that a run that is stopped has left what it measured.

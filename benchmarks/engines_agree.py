@@ -1,0 +1,56 @@
+"""Whether a policy scores the same on both engines: the demo's Go1, on the same 32 episodes.
+
+Without a GPU, Warp runs on the CPU, which takes five minutes.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from report import Row, show
+
+TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
+POLICY = Path(__file__).parents[1] / "src/mjlab/demo/go1_velocity.onnx"
+NUM_EPISODES = 32
+
+
+def evaluate(engine: str) -> dict[str, Any]:
+    """Return what `evaluate --json True` prints."""
+    command = [sys.executable, "-m", "mjlab.scripts.evaluate", TASK, "--engine", engine]
+    command += ["--checkpoint-file", str(POLICY), "--num-episodes", str(NUM_EPISODES)]
+    done = subprocess.run([*command, "--json", "True"], capture_output=True, text=True)
+    if done.returncode != 0:
+        raise RuntimeError(f"Evaluating on {engine} failed:\n{done.stderr[-2000:]}")
+    return json.loads(done.stdout)
+
+
+def measure() -> list[Row]:
+    """Return one row."""
+    native, warp = evaluate("native"), evaluate("warp")
+    low, high = native["return_interval"]
+    return [
+        Row(
+            f"the demo's Go1 policy on Warp, {NUM_EPISODES} episodes",
+            _shown(warp),
+            f"native, the same episodes: {_shown(native)}",
+            "return within the 95 % interval of native",
+            low <= warp["mean_return"] <= high,
+        )
+    ]
+
+
+def _shown(result: dict[str, Any]) -> str:
+    low, high = result["return_interval"]
+    errors = ", ".join(f"{name} {v['mean']:.3f}" for name, v in result["metrics"].items())
+    return (
+        f"return {result['mean_return']:.0f} [{low:.0f}, {high:.0f}]; {errors}; "
+        f"{result['failure_rate']:.1%} failed"
+    )
+
+
+if __name__ == "__main__":
+    print(show(measure()))
