@@ -6,11 +6,11 @@ Without a GPU, Warp runs on the CPU, which takes five minutes.
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+from commands import output_of
 from report import Row, show
 
 TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
@@ -22,10 +22,7 @@ def evaluate(engine: str) -> dict[str, Any]:
     """Return what `evaluate --json True` prints."""
     command = [sys.executable, "-m", "mjlab.scripts.evaluate", TASK, "--engine", engine]
     command += ["--checkpoint-file", str(POLICY), "--num-episodes", str(NUM_EPISODES)]
-    done = subprocess.run([*command, "--json", "True"], capture_output=True, text=True)
-    if done.returncode != 0:
-        raise RuntimeError(f"Evaluating on {engine} failed:\n{done.stderr[-2000:]}")
-    return json.loads(done.stdout)
+    return json.loads(output_of([*command, "--json", "True"]))
 
 
 def measure() -> list[Row]:

@@ -11,6 +11,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from commands import output_of
 from report import Row, show
 
 TASK = "Mjlab-Cartpole-Swingup"
@@ -53,8 +54,8 @@ def _confirm(log_root: str) -> float:
     """Return the mean return of the newest policy, scored by `evaluate` on a seed of its own."""
     command = [sys.executable, "-m", "mjlab.scripts.evaluate", TASK, "--log-root", log_root]
     command += ["--num-episodes", str(EPISODES), "--json", "True", "--device", "cpu"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return float(json.loads(done.stdout[done.stdout.index("{") :])["mean_return"])
+    printed = output_of(command)
+    return float(json.loads(printed[printed.index("{") :])["mean_return"])
 
 
 def bare_loop(iterations: int, seed: int) -> float:

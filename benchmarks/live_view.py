@@ -16,7 +16,6 @@ import json
 import multiprocessing
 import os
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -26,6 +25,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import viser
+from commands import output_of
 from report import Row
 from websockets.sync.client import connect
 
@@ -149,11 +149,7 @@ def summary(rows: list[tuple[int, float, float, float]]) -> dict[str, float]:
 
 def measure(minutes: float = 10.0) -> list[Row]:
     """Measure in a process of its own, for training takes over its process; return one row."""
-    command = [sys.executable, __file__, str(minutes)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    if done.returncode != 0:
-        raise RuntimeError(f"Training with `--live` failed:\n{done.stderr[-2000:]}")
-    seen = json.loads(done.stdout.splitlines()[-1])
+    seen = json.loads(output_of([sys.executable, __file__, str(minutes)]).splitlines()[-1])
     cost, error = 1.0 - seen["ratio"], seen["ratio_standard_error"]
     return [
         Row(

@@ -19,6 +19,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from commands import output_of
 from report import Row, show
 
 TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
@@ -60,8 +61,7 @@ def bare(seed: int, minutes: float) -> dict[str, float] | None:
     """Return the last evaluation of the bare loop, or None if it did not come to one."""
     script = Path(__file__).parent / "bare_go1.py"
     command = [sys.executable, str(script), str(minutes), str(seed)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    lines = [line for line in done.stdout.splitlines() if line.startswith('{"seconds"')]
+    lines = [line for line in output_of(command).splitlines() if line.startswith('{"seconds"')]
     return json.loads(lines[-1]) if lines else None
 
 

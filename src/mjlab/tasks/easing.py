@@ -82,6 +82,9 @@ def undo_all(undos: Sequence[Undo]) -> Undo:
 class Easing(ManagerTermBase):
     """Base of curriculum terms that ease something until so many environment steps are made."""
 
+    def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
+        super().__init__(env)
+
     def fraction(self, steps: int) -> float:
         """Return how much of `steps` is over, from 0 to 1."""
         return min(self._env.common_step_counter / steps, 1.0)
@@ -96,7 +99,7 @@ class GrowingWeight(Easing):
     _transient = {"_last"}
 
     def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
-        super().__init__(env)
+        super().__init__(cfg, env)
         name = cfg.params["reward_name"]
         has_it = env.cfg.rewards.get(name) is not None
         self._last = env.reward_manager.get_term_cfg(name).weight if has_it else None
@@ -127,7 +130,7 @@ class GrowingPushes(Easing):
     _transient = {"_full"}
 
     def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
-        super().__init__(env)
+        super().__init__(cfg, env)
         name = cfg.params["event_name"]
         self._full: Ranges | None = None
         if env.cfg.events.get(name) is not None:

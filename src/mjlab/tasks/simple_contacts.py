@@ -5,17 +5,14 @@ On the Go1 that walks, the physics of a step takes half the time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.tasks.easing import Undo
 
 _ROBOT = "robot"
 _SLIDING = 3
 
 
-def simplify_contacts(
-    env_cfg: ManagerBasedRlEnvCfg,
-) -> Callable[[ManagerBasedRlEnvCfg], None]:
+def simplify_contacts(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
     """Make friction cones pyramidal, and take rolling and torsional friction from the robot.
 
     Edits the config in place. Returns what gives such a config, or a copy, the contacts back.

@@ -68,9 +68,6 @@ class GrowingStarts(Easing):
     Returns the fraction that it has reached.
     """
 
-    def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
-        super().__init__(env)
-
     def __call__(
         self, env: ManagerBasedRlEnv, env_ids: torch.Tensor | slice, command_name: str, steps: int
     ) -> float:

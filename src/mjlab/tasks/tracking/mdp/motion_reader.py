@@ -164,7 +164,7 @@ class MotionReader:
         """
         rows: Any = slice(None) if env_ids is None else env_ids
         frames = self.frame_indexes[rows]
-        # Origins of environments cancel out.
+        # Along x and y the origins of environments cancel out.
         body_pos, body_quat = self.motion.body_pos_w[frames], self.motion.body_quat_w[frames]
         origins_z = self.scene.env_origins[rows, 2]
         robot_pos, robot_quat = self.robot_anchor_pos_w[rows], self.robot_anchor_quat_w[rows]
