@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import logging
 import math
+from collections.abc import Generator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -88,6 +90,7 @@ class ManagerBasedRlEnv:
             self.sim.set_sensor_context(self.scene.sensor_context)
 
         self.common_step_counter = 0
+        self._holds_common_steps = False
         self._sim_step_counter = 0
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=device)
         self._pending_reset = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
@@ -285,7 +288,8 @@ class ManagerBasedRlEnv:
         self.action_manager.process_action(as_action(action, self.device))
         self._run_physics()
         self.episode_length_buf += 1
-        self.common_step_counter += 1
+        if not self._holds_common_steps:
+            self.common_step_counter += 1
 
         self.reset_buf = self.termination_manager.compute()
         self.reset_terminated = self.termination_manager.terminated
@@ -315,6 +319,18 @@ class ManagerBasedRlEnv:
             self.reset_time_outs,
             self.extras,
         )
+
+    @contextlib.contextmanager
+    def common_steps_held(self) -> Generator[None]:
+        """Within this context steps do not count as steps of training.
+
+        `common_step_counter` stands still, and with it the curricula that go by it. For evaluations.
+        """
+        held, self._holds_common_steps = self._holds_common_steps, True
+        try:
+            yield
+        finally:
+            self._holds_common_steps = held
 
     def _run_physics(self) -> None:
         substeps = self.cfg.decimation

@@ -113,6 +113,13 @@ class CommandTerm(ManagerTermBase):
         self._resample(ids)
         return log
 
+    def take_turns_from(self, episode: int) -> None:
+        """Hear that the next reset, of all environments, begins with this episode of an evaluation.
+
+        For commands that share something out evenly over episodes, such as motions: environment i
+        is about to play episode `episode + i`. Does nothing unless overridden.
+        """
+
     def debug_vis(self, visualizer: DebugVisualizer) -> None:
         """Draw the command if the config says so."""
         if self.cfg.debug_vis:

@@ -134,7 +134,7 @@ class RslRlBaseRunnerCfg:
     """A training run."""
 
     seed: int = 42
-    """Seed of the run. The environment gets it too (plus the process rank on several GPUs)."""
+    """Seed of the run, of the environment too. Further processes of the run derive theirs from it."""
     num_steps_per_env: int = 24
     """Environment steps per iteration."""
     max_iterations: int = 300

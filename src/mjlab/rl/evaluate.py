@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import logging
 import operator
 import time
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Generator, Mapping
+from contextlib import ExitStack, contextmanager
 from functools import reduce
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,8 @@ from mjlab.rl.threads import threads_for_policy
 
 if TYPE_CHECKING:
     from mjlab.rl.vecenv_wrapper import RslRlVecEnvWrapper
+
+logger = logging.getLogger(__name__)
 
 # Whether all episodes have ended is asked this often, because asking makes the host wait for a GPU.
 _STEPS_BETWEEN_CHECKS = 16
@@ -45,16 +48,20 @@ def evaluate_policy(
 
     Each environment is scored once in a round, on its first episode after a reset, so that short
     episodes do not count more often than long ones. Where more episodes are asked for than there
-    are environments, there are several rounds. No curriculum moves environments to other terrain
-    meanwhile, so that no round or evaluation is harder than the one before. On the CPU, torch gets
-    as many threads as the policy is worth.
+    are environments, there are several rounds. No round or evaluation is harder than the one
+    before: steps do not count as steps of training (`common_step_counter` stands still), no
+    curriculum moves environments to other terrain, and the environments are left in the state in
+    which they were found. On the CPU, torch gets as many threads as the policy is worth.
+
+    An episode that `max_steps` cuts off is not a success, whatever a success is.
 
     Args:
-        env: The environments; their state is not kept.
+        env: The environments.
         policy: `policy(observations) -> actions (num_envs, num_actions)`, usually
             `runner.get_inference_policy()`, which does not explore.
         num_episodes: Episodes to score; None: one for each environment.
-        max_steps: Episodes are cut off after this many steps; None: the task's episode length.
+        max_steps: Episodes are cut off after this many steps; None: the task's episode length,
+            after which episodes count as finished.
         success_return: An episode with at least this return is a success.
         success_func: Instead, `func(env) -> (num_envs,) bool`; its value one step before the end
             of an episode decides.
@@ -62,7 +69,8 @@ def evaluate_policy(
             is a success.
         metrics: For each name, `func(env) -> (num_envs,)`, read before every step and averaged over
             the steps of an episode.
-        seed: Seed of the evaluation; None leaves the generators as they are.
+        seed: Seed of the evaluation; None leaves the generators as they are. With the same seed,
+            environments in the same state give the same episodes.
 
     Raises:
         ValueError: `num_episodes` is not positive, or the episodes have no end.
@@ -75,12 +83,14 @@ def evaluate_policy(
     rounds = []
     with (
         threads_for_policy(policy, env.num_envs, env.device),
-        _terrain_held(env),
         torch.inference_mode(),
+        _left_as_found(env),
+        _training_held(env),
     ):
         for first in range(0, num_episodes, env.num_envs):
             count = min(env.num_envs, num_episodes - first)
             record = _Recorder(env, count, success_func, metrics or {})
+            _take_turns(env, first)
             rounds.append(_play_round(env, policy, record, max_steps))
     episodes = reduce(operator.add, rounds)
     successes = episodes.succeeded if success_func is not None else None
@@ -88,13 +98,50 @@ def evaluate_policy(
         successes = ~episodes.failed
     if successes is None and success_return is not None:
         successes = episodes.returns >= success_return
+    if successes is not None:
+        successes = successes & episodes.finished
     return summarize(episodes, successes, time.perf_counter() - start)
 
 
-def _terrain_held(env: RslRlVecEnvWrapper) -> AbstractContextManager[None]:
-    """Return a context in which no curriculum moves the environments to other terrain."""
-    terrain = getattr(getattr(env.unwrapped, "scene", None), "terrain", None)
-    return nullcontext() if terrain is None else terrain.levels_held()
+@contextmanager
+def _left_as_found(env: RslRlVecEnvWrapper) -> Generator[None]:
+    """Give environments back the state that they had before the block.
+
+    What outlives a reset, such as counters of terms, would let evaluations depend on those before.
+    """
+    unwrapped: Any = env.unwrapped
+    if not hasattr(unwrapped, "state_dict"):
+        yield
+        return
+    state = unwrapped.state_dict()
+    yield
+    try:
+        unwrapped.load_state_dict(state)
+    except ValueError as error:
+        logger.warning(
+            "The state of the evaluated environments is not restored, so that another evaluation "
+            "in them may differ. %s", error,
+        )  # fmt: skip
+
+
+@contextmanager
+def _training_held(env: RslRlVecEnvWrapper) -> Generator[None]:
+    """Within this context no curriculum goes on: not by steps, and not by moving to other terrain."""
+    unwrapped: Any = env.unwrapped
+    terrain = getattr(getattr(unwrapped, "scene", None), "terrain", None)
+    with ExitStack() as stack:
+        if terrain is not None:
+            stack.enter_context(terrain.levels_held())
+        if hasattr(unwrapped, "common_steps_held"):
+            stack.enter_context(unwrapped.common_steps_held())
+        yield
+
+
+def _take_turns(env: RslRlVecEnvWrapper, first_episode: int) -> None:
+    """Tell commands that take turns, such as motions, which episode the next reset begins with."""
+    manager: Any = getattr(env.unwrapped, "command_manager", None)
+    for name in manager.active_terms if manager is not None else ():
+        manager.get_term(name).take_turns_from(first_episode)
 
 
 def _resolve_max_steps(env: RslRlVecEnvWrapper, num_episodes: int, max_steps: int | None) -> int:
@@ -180,7 +227,7 @@ class _Recorder:
         return Episodes(
             returns=self._returns[first] / reward_unit(self._env),
             lengths=lengths,
-            finished=~self.running[first],
+            finished=~self.running[first] | (lengths >= int(self._env.max_episode_length)),
             failed=self._failed[first],
             succeeded=self._succeeded[first],
             terminations={name: value[first] for name, value in self._ended_by.items()},

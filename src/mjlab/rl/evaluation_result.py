@@ -11,6 +11,8 @@ import torch
 
 # Two-sided 95 % of the normal distribution.
 _Z95 = 1.959964
+# Fewer episodes say little of what happens in one of a hundred.
+_MANY_EPISODES = 200
 
 FIGURES = ("mean_return", "mean_length", "success_rate", "failure_rate")
 """Fields of `EvaluationResult` that `EvaluationResult.figure` knows, beside the metrics."""
@@ -22,8 +24,8 @@ class MeanAndInterval:
 
     mean: float
     """The mean."""
-    interval: tuple[float, float]
-    """Its 95 % confidence interval (normal approximation)."""
+    interval: tuple[float, float] | None
+    """95 % confidence interval of the mean (Student's t); None for one episode."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -38,10 +40,10 @@ class EvaluationResult:
     """Episodes scored."""
     mean_return: float
     """Mean return."""
-    return_interval: tuple[float, float]
-    """95 % confidence interval of the mean return (normal approximation)."""
-    std_return: float
-    """Standard deviation of the return between episodes."""
+    return_interval: tuple[float, float] | None
+    """95 % confidence interval of the mean return (Student's t); None for one episode."""
+    std_return: float | None
+    """Sample standard deviation of the return between episodes; None for one episode."""
     min_return: float
     """Lowest return."""
     max_return: float
@@ -49,7 +51,8 @@ class EvaluationResult:
     mean_length: float
     """Mean length of an episode, in environment steps."""
     success_rate: float | None = None
-    """Fraction of episodes that succeeded; None where the task does not define success."""
+    """Fraction of episodes that succeeded, unfinished ones not among them; None where the task does
+    not define success."""
     success_interval: tuple[float, float] | None = None
     """95 % confidence interval of the success rate (Wilson)."""
     failure_rate: float | None = None
@@ -61,17 +64,35 @@ class EvaluationResult:
     metrics: dict[str, MeanAndInterval] = dataclasses.field(default_factory=dict)
     """The task's metrics, each averaged over an episode's steps and then over episodes."""
     num_unfinished: int = 0
-    """Episodes that were cut off by `max_steps`."""
+    """Episodes that `max_steps` cut off before the time of an episode of the task was over."""
     duration: float = 0.0
     """Time taken, in seconds."""
     returns: tuple[float, ...] = dataclasses.field(default=(), repr=False)
     """Return of each episode."""
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What to bear in mind with these figures, in sentences."""
+        notes = []
+        if self.num_unfinished:
+            notes.append(
+                f"{self.num_unfinished} of {self.num_episodes} episodes were cut off by max_steps. "
+                "They count as neither successes nor failures."
+            )
+        if self.num_episodes == 1:
+            notes.append("One episode gives no interval of a mean.")
+        if self.num_episodes < _MANY_EPISODES:
+            notes.append(
+                f"Below {_MANY_EPISODES} episodes, rare failures make intervals of means "
+                "optimistic: they may be missing. Judge failures by the interval of their rate."
+            )
+        return tuple(notes)
+
     def to_dict(self) -> dict[str, Any]:
-        """Return all figures but the single returns."""
+        """Return all figures but the single returns, and `notes`."""
         figures = dataclasses.asdict(self)
         del figures["returns"]
-        return figures
+        return {**figures, "notes": list(self.notes)}
 
     def to_json(self) -> str:
         """Return the figures as JSON."""
@@ -103,7 +124,7 @@ class Episodes:
     lengths: torch.Tensor
     """Steps, (E,) int64."""
     finished: torch.Tensor
-    """Whether the episode ended by itself, (E,) bool."""
+    """Whether the episode ended by itself, or lasted as long as episodes of the task do, (E,) bool."""
     failed: torch.Tensor
     """Whether a termination ended it before its time was over, (E,) bool."""
     succeeded: torch.Tensor
@@ -137,7 +158,7 @@ def summarize(
         num_episodes=count,
         mean_return=mean_return.mean,
         return_interval=mean_return.interval,
-        std_return=returns.std().item() if count > 1 else 0.0,
+        std_return=returns.std().item() if count > 1 else None,
         min_return=returns.min().item(),
         max_return=returns.max().item(),
         mean_length=episodes.lengths.double().mean().item(),
@@ -154,10 +175,14 @@ def summarize(
 
 
 def mean_and_interval(values: torch.Tensor) -> MeanAndInterval:
-    """Return the mean of `values` (E,) and its 95 % confidence interval."""
-    mean = values.double().mean().item()
-    std = values.double().std().item() if len(values) > 1 else 0.0
-    half = _Z95 * std / math.sqrt(len(values))
+    """Return the mean of `values` (E,) and its 95 % confidence interval, x +- t_(E-1) s / sqrt(E)."""
+    mean, count = values.double().mean().item(), len(values)
+    if count == 1:
+        return MeanAndInterval(mean, None)
+    # Not at the top: it takes a tenth of a second, which a run that is not evaluated saves.
+    from scipy.special import stdtrit
+
+    half = float(stdtrit(count - 1, 0.975)) * values.double().std().item() / math.sqrt(count)
     return MeanAndInterval(mean, (mean - half, mean + half))
 
 
@@ -172,3 +197,11 @@ def wilson_interval(rate: float, count: int) -> tuple[float, float]:
     half = _Z95 * math.sqrt(rate * (1 - rate) / count + _Z95**2 / (4 * count**2)) / shrink
     # The interval contains the rate; rounding must not say otherwise.
     return max(0.0, min(centre - half, rate)), min(1.0, max(centre + half, rate))
+
+
+def episodes_to_show(rate: float) -> int:
+    """Return how many episodes without a failure show that at most `rate` fail.
+
+    That is where `wilson_interval(0, n)`, which ends at z^2 / (n + z^2), ends at `rate`.
+    """
+    return math.ceil(_Z95**2 * (1.0 - rate) / rate)

@@ -57,7 +57,16 @@ class TrainingObserver:
         """An iteration has finished."""
 
     def on_evaluation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
-        """The policy was evaluated after `iteration` iterations."""
+        """The policy was evaluated after `iteration` iterations; `solved` if it met all conditions.
+
+        Training does not stop yet: `on_confirmation` follows, unless training goes on anyway.
+        """
+
+    def on_confirmation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
+        """A policy that met all conditions was evaluated in other episodes; `solved` if it did again.
+
+        Training stops then.
+        """
 
     def on_checkpoint(self, path: str) -> None:
         """A checkpoint was written."""

@@ -190,18 +190,20 @@ class RunLogger(Logger):
             self._write_failed = True
             logger.warning("Figures are no longer written to %s: %s", self.log_dir, error)
 
-    def write_evaluation(self, result: EvaluationResult, iteration: int) -> None:
-        """Write the figures of an evaluation after iteration number `iteration` (from 0)."""
-        scalars = {
-            "Evaluation/mean_return": result.mean_return,
-            "Evaluation/mean_length": result.mean_length,
-        }
+    def write_evaluation(
+        self, result: EvaluationResult, iteration: int, group: str = "Evaluation"
+    ) -> None:
+        """Write the figures of an evaluation after iteration number `iteration` (from 0).
+
+        `group` is what their tags begin with.
+        """
+        scalars = {"mean_return": result.mean_return, "mean_length": result.mean_length}
         if result.success_rate is not None:
-            scalars["Evaluation/success_rate"] = result.success_rate
+            scalars["success_rate"] = result.success_rate
         if result.failure_rate is not None:
-            scalars["Evaluation/failure_rate"] = result.failure_rate
-        scalars |= {f"Evaluation/{name}": value.mean for name, value in result.metrics.items()}
-        self.write_scalars(scalars, iteration)
+            scalars["failure_rate"] = result.failure_rate
+        scalars |= {name: value.mean for name, value in result.metrics.items()}
+        self.write_scalars({f"{group}/{name}": v for name, v in scalars.items()}, iteration)
 
     def stop_logging_writer(self) -> None:
         """Flush and close the event file."""

@@ -48,17 +48,13 @@ from mjlab.rl.stop_request import StopRequest
 from mjlab.rl.symmetry_check import check_symmetry
 from mjlab.rl.threads import torch_threads, using_torch_threads
 from mjlab.utils.processes import process_rank
-from mjlab.utils.random import seed_rng
+from mjlab.utils.random import seed_rng, session_seed
 
 logger = logging.getLogger(__name__)
 
 _RECURRENT_KEYS = ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")
 # What `learn` ends with, in the order in which one outweighs another between processes.
 _REASONS = ("", "solved", "interrupted")
-# From the seeds of a session of several processes to those of the one that resumes it an iteration
-# later: more than there are processes.
-_SEED_STRIDE = 100_003
-_NUM_SEEDS = 2**32
 
 
 class MjlabOnPolicyRunner(OnPolicyRunner):
@@ -69,7 +65,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     number of iterations finished. Progress goes to `observers` instead of the console.
 
     After `learn`, `stop_reason` is `finished`, `solved`, `interrupted` (SIGINT or SIGTERM) or
-    `failed`, and `last_evaluation` the last evaluation's result, if there was one.
+    `failed`, and `last_evaluation` the last evaluation's result, if there was one. Of a run that was
+    solved, that is the evaluation that confirmed it.
     """
 
     # Any: an environment has more than rsl_rl's `VecEnv` says (`unwrapped`).
@@ -280,14 +277,21 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
 
     def _is_solved(self, stats: IterationStats) -> bool:
         """Evaluate the policy if it may have solved the task; return whether to stop for it."""
-        if not self._solved_check.is_due(stats):
+        check, iteration = self._solved_check, stats.iteration
+        if not check.is_due(stats):
             return False
-        self._solved_check.last_iteration = stats.iteration
+        check.last_iteration = iteration
         result = self.evaluate()
-        solved = self._solved_check.is_solved_by(result)
-        self._tell("on_evaluation", stats.iteration, result, solved)
-        self.logger.write_evaluation(result, stats.iteration - 1)
-        return solved and self._solved_check.stops_training
+        is_good = check.is_solved_by(result)
+        self._tell("on_evaluation", iteration, result, is_good)
+        self.logger.write_evaluation(result, iteration - 1)
+        if not (is_good and check.stops_training):
+            return False
+        self.last_evaluation = result = check.confirm(iteration)
+        solved = check.is_solved_by(result)
+        self._tell("on_confirmation", iteration, result, solved)
+        self.logger.write_evaluation(result, iteration - 1, "Confirmation")
+        return solved
 
     def evaluate(self) -> EvaluationResult:
         """Score the policy in environments of its own; the run itself is not touched."""
@@ -423,8 +427,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         )
         self.logger.load_totals(state["logger"])
         # Otherwise, every session would draw the numbers of the first one again.
-        seed = int(self.cfg.get("seed", 0)) + _SEED_STRIDE * self.current_learning_iteration
-        seed_rng(seed % _NUM_SEEDS)
+        seed_rng(session_seed(int(self.cfg.get("seed", 0)), self.current_learning_iteration))
 
     def _save_checkpoint(self) -> None:
         """Write a checkpoint into the run folder, and the policy as ONNX beside it."""

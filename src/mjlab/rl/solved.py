@@ -1,17 +1,28 @@
-"""Watching, while training goes on, for the moment when the task is solved."""
+"""Solved or not: evaluations beside a training run, and what a policy must reach in them.
+
+Training stops on two evaluations. The first is of the same episodes each time, so that what changes is
+the policy. A noisy policy that is tried often enough passes it by luck, hence the second, of episodes
+that no evaluation of the run has had before.
+"""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from typing import Any
 
 from mjlab.rl.evaluate import evaluate_policy, make_evaluation_env
-from mjlab.rl.evaluation_result import FIGURES, EvaluationResult
+from mjlab.rl.evaluation_result import (
+    FIGURES,
+    EvaluationResult,
+    episodes_to_show,
+    wilson_interval,
+)
 from mjlab.rl.progress import IterationStats
 from mjlab.rl.rng import preserved_rng
+from mjlab.utils.random import evaluation_seed
 
-# Added to the run's seed, so that evaluation does not start from states seen in training.
-_SEED_OFFSET = 1_000_003
+logger = logging.getLogger(__name__)
 
 
 class SolvedCheck:
@@ -30,13 +41,15 @@ class SolvedCheck:
         self._env = env
         self._algorithm = algorithm
         self._cfg = cfg
-        self._seed = seed + _SEED_OFFSET
+        self._seed = seed
         self._below: dict[str, float] = cfg.get("solved_below") or {}
         self._above: dict[str, float] = cfg.get("solved_above") or {}
         target = cfg.get("solved_return")
         self._has_target = target is not None or bool(self._below or self._above)
         self._min_interval = int(cfg.get("min_interval", 3))
+        self._num_episodes = int(cfg.get("num_episodes", 256))
         _check_conditions({**self._below, **self._above}, cfg)
+        _warn_of_few_episodes(self._below, self._above, self._num_episodes)
         self._beside: Any = None
         self.last_iteration = 0
 
@@ -70,15 +83,37 @@ class SolvedCheck:
         return bool(self._cfg.get("stop_when_solved", True))
 
     def evaluate(self) -> EvaluationResult:
-        """Score the policy in environments of their own, built at the first call."""
+        """Score the policy in environments of their own, built at the first call.
+
+        The episodes are the same each time.
+        """
         if self._beside is None:
-            count = self._cfg.get("num_episodes", 256)
-            prepare = self._cfg.get("prepare_env")
-            self._beside = make_evaluation_env(self._env, count, self._seed, prepare)
+            self._beside = self._make_env(evaluation_seed(self._seed))
+        return self._score(self._beside, evaluation_seed(self._seed))
+
+    def confirm(self, iteration: int) -> EvaluationResult:
+        """Score the policy after `iteration` iterations in other environments, and other episodes.
+
+        No other evaluation of the run has them. They follow from the seed and the iteration, so
+        that a resumed run has the same ones.
+        """
+        seed = evaluation_seed(self._seed, iteration)
+        env = self._make_env(seed)
+        try:
+            return self._score(env, seed)
+        finally:
+            env.close()
+
+    def _make_env(self, seed: int) -> Any:
+        return make_evaluation_env(
+            self._env, self._num_episodes, seed, self._cfg.get("prepare_env")
+        )
+
+    def _score(self, env: Any, seed: int) -> EvaluationResult:
         # Curricula count the steps of training.
         counter = getattr(self._env.unwrapped, "common_step_counter", None)
         if counter is not None:
-            self._beside.unwrapped.common_step_counter = counter
+            env.unwrapped.common_step_counter = counter
         policy = self._algorithm.get_policy()
         hidden_state = policy.get_hidden_state()
         success_return = self._cfg.get("success_return")
@@ -88,13 +123,13 @@ class SolvedCheck:
         try:
             with preserved_rng():
                 return evaluate_policy(
-                    self._beside,
+                    env,
                     policy,
                     success_return=success_return,
                     success_func=self._cfg.get("success_func"),
                     success_is_survival=bool(self._cfg.get("success_is_survival")),
                     metrics=self._cfg.get("metrics"),
-                    seed=self._seed,
+                    seed=seed,
                 )
         finally:
             self._algorithm.train_mode()
@@ -119,3 +154,19 @@ def _check_conditions(names: Iterable[str], cfg: dict[str, Any]) -> None:
                 f"EvaluationCfg: solved_below or solved_above names {name!r}, which is not "
                 f"measured. Add it to `metrics`, or take one of {', '.join(sorted(known))}."
             )
+
+
+def _warn_of_few_episodes(
+    below: dict[str, float], above: dict[str, float], num_episodes: int
+) -> None:
+    """Warn of bounds on rates that so few episodes cannot show, even if none of them fails."""
+    allowed = {"failure_rate": below.get("failure_rate", 1.0)}
+    allowed["success_rate"] = 1.0 - above.get("success_rate", 0.0)
+    for name, failures in allowed.items():
+        if failures > 0.0 and num_episodes < (needed := episodes_to_show(failures)):
+            logger.warning(
+                "EvaluationCfg: the bound on %s allows %.3g %% to fail, which %d episodes cannot "
+                "show: if none of them fails, %.3g %% of all may (95 %% interval). Use "
+                "num_episodes >= %d.", name, 100.0 * failures, num_episodes,
+                100.0 * wilson_interval(0.0, num_episodes)[1], needed,
+            )  # fmt: skip

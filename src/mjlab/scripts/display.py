@@ -62,11 +62,22 @@ class TrainingDisplay(TrainingObserver):
 
     def on_evaluation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
         """Tell how an evaluation went."""
-        verdict = "solved" if solved else "not solved yet"
-        figures = [f"mean return {result.mean_return:.1f} over {result.num_episodes} episodes"]
+        verdict = "within all bounds" if solved else "not solved yet"
+        self._tell_evaluation(iteration, "episodes", result, verdict)
+
+    def on_confirmation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
+        """Tell how the evaluation went on which training stops or goes on."""
+        verdict = "solved" if solved else "not confirmed, so training goes on"
+        self._tell_evaluation(iteration, "fresh episodes", result, verdict)
+
+    def _tell_evaluation(
+        self, iteration: int, episodes: str, result: EvaluationResult, verdict: str
+    ) -> None:
+        figures = [f"mean return {result.mean_return:.1f} over {result.num_episodes} {episodes}"]
         figures += [f"{name} {value.mean:.3f}" for name, value in result.metrics.items()]
-        if result.failure_rate:
-            figures.append(f"{result.failure_rate:.1%} failed")
+        if result.failure_rate and result.failure_interval is not None:
+            low, high = result.failure_interval
+            figures.append(f"{result.failure_rate:.1%} failed ({low:.1%} to {high:.1%})")
         self._console.print(
             f"Evaluation after {iteration} iterations: {', '.join(figures)}, {verdict}.",
             highlight=False,

@@ -185,14 +185,15 @@ def _run_folder(
 
 
 def _apply_short_forms(cfg: TrainConfig, rank: ProcessRank) -> None:
+    from mjlab.utils.random import process_seed
+
     if cfg.num_envs is not None:
         cfg.env.scene.num_envs = cfg.num_envs
     if cfg.engine is not None:
         cfg.env.sim.engine = cfg.engine
     if cfg.enable_nan_guard:
         cfg.env.sim.nan_guard.enabled = True
-    # Every process draws other random numbers.
-    cfg.agent.seed += rank.rank
+    cfg.agent.seed = process_seed(cfg.agent.seed, rank.rank)
     cfg.env.seed = cfg.agent.seed
     if rank.local_world_size > 1 and cfg.env.sim.num_threads == 0:
         cfg.env.sim.num_threads = cores_per_process()

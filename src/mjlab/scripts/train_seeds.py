@@ -39,10 +39,10 @@ def _command(argv: list[str]) -> None:
     experiment = _experiment(task, flags)
     for seed in range(1, count + 1):
         print(f"\nSeed {seed} of {count}", flush=True)
-        # Curves that are to be averaged have to be of one length, so no run stops early; flags
-        # given by hand come last and win.
+        # Curves to be averaged must be of one length, so that no run may stop when it is solved,
+        # whatever that means for the task. Flags given by hand come last and win.
         command = [sys.executable, "-m", "mjlab.scripts.train", task]
-        command += ["--agent.evaluation.solved-return", "None"]
+        command += ["--agent.evaluation.stop-when-solved", "False"]
         command += [*flags, "--agent.seed", str(seed), "--agent.run-name", f"seed_{seed}"]
         before = set(run_folders(experiment))
         status, stopped = run_forwarding_signals(command)

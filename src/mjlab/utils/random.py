@@ -1,4 +1,10 @@
-"""Seeding of every random number generator a run draws from."""
+"""Seeds: of every random number generator, and of the parts of a run that must not draw alike.
+
+Generators are seeded with 32 bits. The lower half of them is for the processes of a run, the third
+quarter for evaluations, the last for sessions of several processes after a resume. So no part of a
+run draws the numbers of another, and neither does any of a run whose `--agent.seed` differs, as long
+as that is below 2**20 and there are at most 1,000 processes.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +15,10 @@ import numpy as np
 import torch
 
 _MAX_SEED = 2**32 - 1
+_PROCESS_STRIDE = 2**20
+_EVALUATIONS, _SESSIONS = 2**31, 2**31 + 2**30
+# Odd, and near 2**32 over the golden ratio: multiples by small numbers lie far apart.
+_SPREAD = 0x9E3779B1
 
 
 def seed_rng(seed: int, torch_deterministic: bool = False) -> None:
@@ -35,3 +45,30 @@ def seed_rng(seed: int, torch_deterministic: bool = False) -> None:
         # The same as `use_deterministic_algorithms(True, warn_only=True)`, which would load
         # torch's compiler first (seconds).
         torch.set_deterministic_debug_mode("warn")
+
+
+def process_seed(seed: int, rank: int) -> int:
+    """Return the seed of process `rank` of a run with `seed`; that of the first is `seed` itself."""
+    return seed if rank == 0 else (seed + rank * _PROCESS_STRIDE) % 2**32
+
+
+def session_seed(seed: int, iteration: int) -> int:
+    """Return the seed of a process with `seed` whose run is resumed after `iteration` iterations.
+
+    For runs of which a checkpoint does not hold the generators.
+    """
+    return _SESSIONS + _spread(seed, iteration)
+
+
+def evaluation_seed(seed: int, iteration: int = 0) -> int:
+    """Return a seed for evaluations of a run with `seed`.
+
+    Args:
+        seed: Seed of the run.
+        iteration: Each gives other episodes; 0 is for those that are the same in all evaluations.
+    """
+    return _EVALUATIONS + _spread(seed, iteration)
+
+
+def _spread(seed: int, iteration: int) -> int:
+    return (seed * _SPREAD + iteration) % 2**30

@@ -143,7 +143,7 @@ class MotionCommand(MotionReader, CommandTerm):
         self._num_bins = sampler.num_bins
         self.sampler = sampler if cfg.sampling_mode == "adaptive" else None
         self.start_perturbation = 1.0
-        # How often each environment was started, so that it plays one motion after the other.
+        # Number of starts of each environment, so that it plays one motion after the other.
         self._num_starts = torch.zeros_like(self.time_steps)
         # The step in which a failure was last counted, so that none is counted twice.
         self._counted_at = torch.full_like(self.time_steps, -1)
@@ -228,6 +228,13 @@ class MotionCommand(MotionReader, CommandTerm):
         self.motion_ids[env_ids], self.time_steps[env_ids] = self._draw(env_ids)
         self._write_start(env_ids, perturbed=True)
         self._moved.append(env_ids)
+
+    def take_turns_from(self, episode: int) -> None:
+        """Let environment i play motion (`episode` + i) modulo their number next, in mode `start`.
+
+        How often environments were started before depends on how often their robots fell.
+        """
+        self._num_starts.fill_(episode)
 
     def _draw(self, env_ids: torch.Tensor) -> Drawn:
         """Return a motion and a frame for each environment."""
