@@ -11,7 +11,18 @@ from rl_fake_env import FakeEnv, FakeEnvCfg, FakeSceneCfg
 
 from mjlab.rl import RslRlVecEnvWrapper
 from mjlab.rl.evaluate import evaluate_policy, make_evaluation_env
-from mjlab.rl.evaluation_result import wilson_interval
+from mjlab.rl.evaluation_result import (
+    Episodes,
+    EvaluationResult,
+    episodes_to_show,
+    mean_and_interval,
+    summarize,
+    wilson_interval,
+)
+
+
+# 97.5 % of Student's t with three degrees of freedom, from a printed table.
+T95_OF_FOUR = 3.182446
 
 
 class CountingEnv(FakeEnv):
@@ -49,7 +60,7 @@ def test_each_environment_is_scored_on_its_first_episode_only():
     assert result.mean_return == 5.0
     assert result.mean_length == 2.5
     assert (result.min_return, result.max_return) == (1.0, 10.0)
-    half = 1.959964 * result.std_return / math.sqrt(4)
+    half = T95_OF_FOUR * result.std_return / math.sqrt(4)
     assert result.return_interval == pytest.approx((5.0 - half, 5.0 + half))
     assert result.success_rate is None
     assert result.num_unfinished == 0
@@ -70,6 +81,84 @@ def test_episodes_are_cut_off_and_counted_as_unfinished():
     result = evaluate_policy(counting(), still, max_steps=3)
     assert result.returns == (1.0, 3.0, 6.0, 6.0)
     assert result.num_unfinished == 1
+    assert "1 of 4 episodes were cut off" in result.notes[0]
+    assert result.to_dict()["notes"] == list(result.notes)
+
+
+@pytest.mark.parametrize(
+    "success",
+    [
+        {"success_is_survival": True},
+        {"success_return": 0.5},
+        {"success_func": lambda env: torch.ones(4, dtype=torch.bool)},
+    ],
+    ids=lambda success: next(iter(success)),
+)
+def test_an_unfinished_episode_is_no_success(success):
+    assert evaluate_policy(counting(), still, **success).success_rate == 1.0
+    assert evaluate_policy(counting(), still, max_steps=3, **success).success_rate == 0.75
+
+
+def test_an_episode_of_the_full_length_is_finished_without_a_time_out():
+    env = counting()
+    env.max_episode_length = 3
+    result = evaluate_policy(env, still, success_return=0.5)
+    assert result.returns == (1.0, 3.0, 6.0, 6.0)
+    assert (result.num_unfinished, result.success_rate) == (0, 1.0)
+
+
+def test_one_episode_has_no_interval_and_says_so():
+    env = counting(num_envs=1)
+    result = evaluate_policy(env, still, metrics={"one": lambda env: torch.ones(1)})
+    assert result.return_interval is result.std_return is result.metrics["one"].interval is None
+    assert "One episode gives no interval" in " ".join(result.notes)
+    assert json.loads(result.to_json())["return_interval"] is None
+
+
+@pytest.mark.parametrize("count", [2, 5, 30])
+def test_intervals_of_the_mean_contain_it_95_times_in_100(count):
+    generator = torch.Generator().manual_seed(0)
+    samples = torch.randn(4000, count, generator=generator, dtype=torch.float64)
+    intervals = [mean_and_interval(sample).interval for sample in samples]
+    covered = [low <= 0.0 <= high for low, high in intervals]
+    # Three standard errors of the count.
+    assert sum(covered) / 4000 == pytest.approx(0.95, abs=3 * math.sqrt(0.95 * 0.05 / 4000))
+
+
+def test_few_episodes_come_with_a_warning_of_rare_failures():
+    assert "rare failures" in evaluate_policy(counting(199), still).notes[0]
+    assert evaluate_policy(counting(200), still).notes == ()
+
+
+def rates(failures: int, episodes: int) -> EvaluationResult:
+    failed = torch.arange(episodes) < failures
+    played = Episodes(
+        returns=torch.zeros(episodes),
+        lengths=torch.ones(episodes),
+        finished=torch.ones_like(failed),
+        failed=failed,
+        succeeded=~failed,
+        terminations={},
+        metrics={},
+    )
+    return summarize(played, played.succeeded, 0.0)
+
+
+def test_bounds_judge_rates_by_the_middle_of_their_interval():
+    for failures, episodes in ((0, 4), (8, 200), (100, 200), (200, 200)):
+        result = rates(failures, episodes)
+        assert result.judged("failure_rate") == pytest.approx(sum(result.failure_interval) / 2)
+        assert result.judged("success_rate") == pytest.approx(1 - result.judged("failure_rate"))
+        assert result.judged("mean_length") == result.figure("mean_length")
+    assert rates(0, 4).judged("failure_rate") > 0.2
+    assert rates(8, 200).judged("failure_rate") < 0.05 < rates(9, 200).judged("failure_rate")
+
+
+@pytest.mark.parametrize("rate", [0.01, 0.05, 0.2, 0.3])
+def test_so_many_episodes_without_a_failure_show_a_rate_and_one_less_does_not(rate):
+    needed = episodes_to_show(rate)
+    assert rates(0, needed).judged("failure_rate") <= rate
+    assert rates(0, needed - 1).judged("failure_rate") > rate
 
 
 def test_success_is_by_return_or_by_function():
@@ -91,7 +180,7 @@ def test_metrics_are_averaged_over_the_steps_of_an_episode_and_then_over_episode
     )
     steps = result.metrics["steps"]
     assert steps.mean == 0.75
-    half = 1.959964 * torch.tensor([0.0, 0.5, 1.0, 1.5]).std().item() / 2
+    half = T95_OF_FOUR * torch.tensor([0.0, 0.5, 1.0, 1.5]).std().item() / 2
     assert steps.interval == pytest.approx((0.75 - half, 0.75 + half))
     assert result.to_dict()["metrics"]["steps"]["mean"] == 0.75
 
@@ -142,6 +231,44 @@ def test_the_same_seed_gives_the_same_figures():
     one = evaluate_policy(env, still, seed=3)
     assert evaluate_policy(env, still, seed=3).returns == one.returns
     assert evaluate_policy(env, still, seed=4).returns != one.returns
+
+
+class RememberingEnv(FakeEnv):
+    """A counter that survives resets makes every episode worth more than the one before."""
+
+    starts = 0
+
+    def _start_episodes(self, mask):
+        self.starts += 1
+        super()._start_episodes(mask)
+
+    def step(self, action):
+        observations, reward, *rest = super().step(action)
+        return observations, reward + self.starts, *rest
+
+    def state_dict(self):
+        return {**super().state_dict(), "starts": self.starts}
+
+    def load_state_dict(self, state):
+        super().load_state_dict(state)
+        self.starts = state["starts"]
+
+
+def test_what_outlives_a_reset_does_not_reach_the_next_evaluation():
+    env = RslRlVecEnvWrapper(RememberingEnv(FakeEnvCfg()))
+    counter = env.unwrapped.common_step_counter = 50
+    one = evaluate_policy(env, still, 20, seed=3)
+    assert evaluate_policy(env, still, 20, seed=3).returns == one.returns
+    assert env.unwrapped.common_step_counter == counter
+
+
+def test_an_environment_whose_state_does_not_fit_is_evaluated_with_a_warning(caplog):
+    class Refusing(FakeEnv):
+        def load_state_dict(self, state):
+            raise ValueError("It changed its size.")
+
+    evaluate_policy(RslRlVecEnvWrapper(Refusing(FakeEnvCfg())), still)
+    assert "another evaluation in them may differ. It changed its size." in caplog.text
 
 
 def test_a_policy_with_memory_is_reset_with_its_environments():

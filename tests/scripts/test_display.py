@@ -76,6 +76,32 @@ def test_how_an_evaluation_went_is_one_line_in_a_log_file():
     )
 
 
+@pytest.mark.parametrize(("solved", "verdict"), [(True, "solved"), (False, "not confirmed")])
+def test_an_evaluation_that_confirms_is_told_apart_and_failures_have_their_interval(
+    solved, verdict
+):
+    out = io.StringIO()
+    result = EvaluationResult(
+        num_episodes=200,
+        mean_return=512.5,
+        return_interval=None,
+        std_return=None,
+        min_return=450.0,
+        max_return=560.0,
+        mean_length=1000.0,
+        failure_rate=0.03,
+        failure_interval=(0.014, 0.064),
+    )
+    panel = TrainingDisplay("My-Task", Console(file=out, width=40))
+    panel.on_evaluation(120, result, solved=True)
+    panel.on_confirmation(120, result, solved=solved)
+    first, second = out.getvalue().splitlines()
+    assert "within all bounds" in first
+    assert "solved" not in first
+    assert "over 200 fresh episodes, 3.0% failed (1.4% to 6.4%)" in second
+    assert verdict in second
+
+
 @pytest.mark.parametrize(
     ("seconds", "text"),
     [(0.04, "0.0 s"), (8.44, "8.4 s"), (185, "3:05 min"), (7800, "2:10 h"), (3599.6, "1:00 h"),

@@ -128,8 +128,23 @@ def test_evaluation_prints_figures_for_machines_and_nothing_else(run, trained):
 def test_evaluation_prints_a_table_for_people(run, trained):
     outcome = run("evaluate", TASK, *SHORT, "--log-root", str(trained.parents[1]))
     assert outcome.status == 0, outcome.err
-    for part in ("Mean return", "95 % interval", "Success      0.0%", "at least 900", "native"):
+    for part in ("Mean return", "95 % interval", "Success      0.0%", "at least 900", "native",
+                 "Note         4 of 4 episodes were cut off", "rare failures"):  # fmt: skip
         assert part in outcome.out
+
+
+def test_one_episode_is_shown_without_an_interval(run):
+    outcome = run("evaluate", TASK, "--agent", "zero", "--num-episodes", "1", *SHORT[2:])
+    assert outcome.status == 0, outcome.err
+    (line,) = (line for line in outcome.out.splitlines() if line.startswith("Mean return"))
+    assert "no interval" in line
+
+
+def test_episodes_that_are_cut_off_succeed_by_no_definition(run, with_images):
+    argv = ("--num-episodes", "64", "--device", "cpu", "--agent", "random", "--json")
+    cut = json.loads(run("evaluate", with_images, *argv, "--max-steps", "6").out)
+    assert (cut["success_rate"], cut["num_unfinished"]) == (0.0, 64)
+    assert "64 of 64" in cut["notes"][0]
 
 
 def leans_right(env):
@@ -138,7 +153,8 @@ def leans_right(env):
 
 
 def test_success_that_the_task_defines_is_told_with_its_definition(run, with_images):
-    argv = (*SHORT, "--agent", "random", "--num-episodes", "64")
+    argv = ("--num-episodes", "64", "--device", "cpu", "--agent", "random")
+    argv += ("--env.episode-length-s", "0.12")
     figures = json.loads(run("evaluate", with_images, *argv, "--json").out)
     low, high = figures["success_interval"]
     assert low < figures["success_rate"] < high

@@ -10,7 +10,10 @@ import time
 import pytest
 from commands import SMALL, interrupt_training
 
-from mjlab.scripts.run_folder import write_run_info
+from mjlab.rl import EvaluationCfg
+from mjlab.rl.plot import read_scalars
+from mjlab.scripts.run_folder import read_run_info, write_run_info
+from mjlab.tasks import registry
 
 TASK = "Mjlab-Cartpole-Swingup"
 
@@ -36,11 +39,59 @@ def test_each_seed_trains_once_and_to_the_end(run, commands):
         assert command[:4] == [sys.executable, "-m", "mjlab.scripts.train", TASK]
         flags = dict(zip(command[4::2], command[5::2], strict=True))
         assert flags == {
-            "--agent.evaluation.solved-return": "None",
+            "--agent.evaluation.stop-when-solved": "False",
             "--num-envs": "64",
             "--agent.seed": str(seed),
             "--agent.run-name": f"seed_{seed}",
         }
+
+
+# What every policy reaches.
+CONDITIONS = {
+    "return": {"solved_return": -1.0, "trigger_return": -9.0},
+    "below": {"solved_below": {"mean_length": 99.0}},
+    "above": {"solved_above": {"mean_length": 0.0}},
+}
+
+
+@pytest.fixture(params=CONDITIONS)
+def easy(request):
+    """A task that is solved from the first iteration on."""
+
+    def rl_cfg():
+        cfg = registry.load_rl_cfg(TASK)
+        conditions = CONDITIONS[request.param]
+        cfg.evaluation = EvaluationCfg(num_episodes=4, min_interval=1, **conditions)
+        return cfg
+
+    registry.register_mjlab_task("Test-Easy", registry._tasks[TASK].env_cfg, rl_cfg=rl_cfg)
+    yield "Test-Easy"
+    del registry._tasks["Test-Easy"]
+
+
+def test_a_solved_seed_goes_on_to_its_last_iteration_and_is_evaluated(
+    run, easy, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("mjlab.scripts.train_seeds.run_forwarding_signals", _run_here(run))
+    flags = ["--seeds", "1", "--log-root", str(tmp_path), "--agent.max-iterations", "3"]
+    outcome = run("train_seeds", easy, *SMALL[:-4], *flags, "--env.episode-length-s", "0.2")
+    assert outcome.status == 0, outcome.err
+    (run_dir,) = (tmp_path / "cartpole").iterdir()
+    info = read_run_info(run_dir)
+    assert (info["ended"], info["iterations"]) == ("finished", 3)
+    iterations, _ = read_scalars(run_dir, "Evaluation/mean_return")
+    assert list(iterations) == [0, 1, 2]
+
+
+def _run_here(run):
+    """Return what runs a training command in this process, which is faster than in another."""
+
+    def run_here(command):
+        outcome = run("train", *command[3:])
+        assert outcome.status == 0, outcome.err
+        return outcome.status, False
+
+    return run_here
 
 
 def test_five_seeds_are_the_default(run, commands):

@@ -8,8 +8,10 @@ import random
 import numpy as np
 import pytest
 import torch
+from hypothesis import example, given
+from hypothesis import strategies as st
 
-from mjlab.utils.random import seed_rng
+from mjlab.utils.random import evaluation_seed, process_seed, seed_rng, session_seed
 
 
 def _draw() -> tuple[float, float, float]:
@@ -43,3 +45,49 @@ def test_deterministic_algorithms_are_switched_on_when_asked():
 def test_a_seed_out_of_range_is_refused(seed):
     with pytest.raises(ValueError, match=f"seed is {seed}"):
         seed_rng(seed)
+
+
+SEEDS = st.integers(0, 2**20 - 1)
+RANKS = st.integers(0, 1000)
+ITERATIONS = st.integers(1, 100_000)
+
+
+@given(one=st.tuples(SEEDS, RANKS), other=st.tuples(SEEDS, RANKS))
+@example(one=(1, 1), other=(2, 0))
+@example(one=(2**20 - 1, 1000), other=(0, 999))
+def test_no_process_draws_the_numbers_of_another_of_its_run_or_of_one_with_another_seed(one, other):
+    assert (process_seed(*one) == process_seed(*other)) == (one == other)
+    seed_rng(process_seed(*one))
+    drawn = _draw()
+    seed_rng(process_seed(*other))
+    assert (_draw() == drawn) == (one == other)
+
+
+@given(SEEDS)
+def test_a_run_of_one_process_has_the_seed_that_it_was_given(seed):
+    assert process_seed(seed, 0) == seed
+
+
+@given(run=SEEDS, process=st.tuples(SEEDS, RANKS), one=ITERATIONS, other=ITERATIONS)
+@example(run=0, process=(2**20 - 1, 1000), one=1, other=2)
+def test_evaluations_draw_what_no_process_and_no_other_evaluation_of_the_run_does(
+    run, process, one, other
+):
+    evaluations = {evaluation_seed(run), evaluation_seed(run, one), evaluation_seed(run, other)}
+    assert len(evaluations) == (2 if one == other else 3)
+    first, resumed = process_seed(*process), session_seed(process_seed(*process), one)
+    assert len({*evaluations, first, resumed}) == len(evaluations) + 2
+    assert max(*evaluations, first, resumed) < 2**32
+
+
+@given(SEEDS, st.lists(st.tuples(RANKS, ITERATIONS), min_size=2, max_size=2, unique=True))
+def test_sessions_of_a_run_draw_what_none_of_its_processes_drew_before(seed, sessions):
+    one, other = (session_seed(process_seed(seed, rank), iteration) for rank, iteration in sessions)
+    assert one != other
+
+
+def test_runs_with_neighboring_seeds_are_evaluated_in_episodes_of_their_own():
+    # Seeds 0 to 199 lie further apart than any run has iterations.
+    bases = sorted(evaluation_seed(seed) for seed in range(200))
+    gaps = [after - before for before, after in zip(bases, bases[1:], strict=False)]
+    assert min(gaps) > 1_000_000

@@ -96,16 +96,19 @@ class EvaluationCfg:
     solved_below: dict[str, float] = field(default_factory=dict)
     """Further conditions, all to be met: the largest value of figures by name. A figure is a metric
     of `metrics`, `failure_rate`, `success_rate` or `mean_length`. `solved_return` may be None
-    then."""
+    then. Rates are judged by the middle of their 95 % Wilson interval, so that few episodes show
+    little: 8 failures in 200 as 4.9 %, none in 4 as 24 %."""
     solved_above: dict[str, float] = field(default_factory=dict)
     """Likewise the smallest value of figures."""
     metrics: dict[str, Callable[[Any], Any]] = field(default_factory=dict)
     """What evaluations measure beside the return: `func(env) -> (num_envs,)` by name, averaged over
     the steps of an episode."""
     stop_when_solved: bool = True
-    """Whether training stops there."""
+    """Whether training stops there, once an evaluation of episodes that were not used before
+    confirms it."""
     num_episodes: int = 256
-    """Episodes of an evaluation; each environment plays one, with the deterministic policy."""
+    """Episodes of an evaluation, and of the one that confirms it; each environment plays one, with
+    the deterministic policy."""
     trigger_fraction: float = 0.8
     """An evaluation takes time, so it waits until the mean reward of the training data, times the
     length of an episode, reaches this fraction of `solved_return`. Below 1, because training

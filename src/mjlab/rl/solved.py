@@ -12,12 +12,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from mjlab.rl.evaluate import evaluate_policy, make_evaluation_env
-from mjlab.rl.evaluation_result import (
-    FIGURES,
-    EvaluationResult,
-    episodes_to_show,
-    wilson_interval,
-)
+from mjlab.rl.evaluation_result import FIGURES, EvaluationResult, episodes_to_show
 from mjlab.rl.progress import IterationStats
 from mjlab.rl.rng import preserved_rng
 from mjlab.utils.random import evaluation_seed
@@ -73,8 +68,8 @@ class SolvedCheck:
         if target is not None and result.mean_return < target:
             return False
         # Written so that NaN meets nothing.
-        return all(result.figure(name) <= most for name, most in self._below.items()) and all(
-            result.figure(name) >= least for name, least in self._above.items()
+        return all(result.judged(name) <= most for name, most in self._below.items()) and all(
+            result.judged(name) >= least for name, least in self._above.items()
         )
 
     @property
@@ -159,14 +154,13 @@ def _check_conditions(names: Iterable[str], cfg: dict[str, Any]) -> None:
 def _warn_of_few_episodes(
     below: dict[str, float], above: dict[str, float], num_episodes: int
 ) -> None:
-    """Warn of bounds on rates that so few episodes cannot show, even if none of them fails."""
+    """Warn of bounds on rates that so few episodes never meet, even if none of them fails."""
     allowed = {"failure_rate": below.get("failure_rate", 1.0)}
     allowed["success_rate"] = 1.0 - above.get("success_rate", 0.0)
     for name, failures in allowed.items():
         if failures > 0.0 and num_episodes < (needed := episodes_to_show(failures)):
             logger.warning(
-                "EvaluationCfg: the bound on %s allows %.3g %% to fail, which %d episodes cannot "
-                "show: if none of them fails, %.3g %% of all may (95 %% interval). Use "
-                "num_episodes >= %d.", name, 100.0 * failures, num_episodes,
-                100.0 * wilson_interval(0.0, num_episodes)[1], needed,
+                "EvaluationCfg: %d episodes never meet the bound on %s, because they say too little "
+                "of failures as rare as %.3g %%; use num_episodes >= %d.",
+                num_episodes, name, 100.0 * failures, needed,
             )  # fmt: skip

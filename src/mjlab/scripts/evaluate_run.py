@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +25,8 @@ class EvaluateConfig(PolicyFlags):
     num_episodes: int = 256
     """Episodes to play, one in each environment."""
     max_steps: int | None = None
-    """Steps after which an episode is cut off; None is the episode length of evaluations."""
+    """Steps after which an episode is cut off, and is no success; None is the episode length of
+    evaluations."""
     seed: int = 0
     """Seed of the evaluation."""
     json: bool = False
@@ -84,30 +86,35 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
 
 
 def _table(figures: dict[str, Any]) -> str:
-    low, high = figures["return_interval"]
     lines = [
         f"Task         {figures['task']}",
         f"Policy       {figures['policy']}",
         f"Physics      {figures['physics']}",
         f"Episodes     {figures['num_episodes']}, mean length {figures['mean_length']:.1f} steps",
-        f"Mean return  {figures['mean_return']:.2f}   95 % interval [{low:.2f}, {high:.2f}]   "
-        f"range [{figures['min_return']:.2f}, {figures['max_return']:.2f}]",
+        f"Mean return  {figures['mean_return']:.2f}   {_interval(figures['return_interval'], '.2f')}"
+        f"   range [{figures['min_return']:.2f}, {figures['max_return']:.2f}]",
         "             (sum over the episode of the weighted reward before scaling by the time step)",
     ]
     if figures["success_rate"] is not None:
-        low, high = figures["success_interval"]
         lines.append(
             f"Success      {figures['success_rate']:.1%}   "
-            f"95 % interval [{low:.1%}, {high:.1%}]   ({figures['success_definition']})"
+            f"{_interval(figures['success_interval'], '.1%')}   ({figures['success_definition']})"
         )
     if figures["failure_rate"] is not None:
-        low, high = figures["failure_interval"]
         ended = [f"{name} {rate:.1%}" for name, rate in figures["terminations"].items() if rate]
         lines.append(
             f"Failures     {figures['failure_rate']:.1%}   "
-            f"95 % interval [{low:.1%}, {high:.1%}]   (ended by: {', '.join(ended) or 'nothing'})"
+            f"{_interval(figures['failure_interval'], '.1%')}   "
+            f"(ended by: {', '.join(ended) or 'nothing'})"
         )
     for name, value in figures["metrics"].items():
-        low, high = value["interval"]
-        lines.append(f"{name:<12} {value['mean']:.4g}   95 % interval [{low:.4g}, {high:.4g}]")
+        lines.append(f"{name:<12} {value['mean']:.4g}   {_interval(value['interval'], '.4g')}")
+    lines += [f"Note         {note}" for note in figures["notes"]]
     return "\n".join(lines)
+
+
+def _interval(bounds: Sequence[float] | None, form: str) -> str:
+    if bounds is None:
+        return "no interval"
+    low, high = bounds
+    return f"95 % interval [{low:{form}}, {high:{form}}]"

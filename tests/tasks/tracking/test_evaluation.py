@@ -86,6 +86,45 @@ def test_several_motions_are_played_by_as_many_environments_each(short, tmp_path
     assert result.mean_length == (24 + 14) / 2
 
 
+class Motions:
+    """Keeps which motion each scored episode plays: `fall` of the robots are thrown over at once."""
+
+    def __init__(self, env: ManagerBasedRlEnv, fall: float) -> None:
+        self.env, self.fall = env, fall
+        self.rounds: list[list[int]] = []
+
+    def __call__(self, observations) -> torch.Tensor:
+        if self.rounds and not self.rounds[-1]:
+            self.rounds[-1] = self.env.command_manager.get_term("motion").motion_ids.tolist()
+        # What makes robots fall at different times, so that they are started differently often.
+        return 50.0 * (torch.rand(self.env.num_envs, 1) < self.fall) * torch.ones(1, 29)
+
+    def reset(self, dones=None) -> None:
+        if dones is None:
+            self.rounds.append([])
+
+
+def test_motions_are_shared_out_evenly_over_episodes_whatever_falls_and_the_same_again(
+    short, tmp_path
+):
+    motions = [short, *(part_of("wave", slice(0, n), tmp_path / f"{n}.npz") for n in (15, 20))]
+    cfg = task_cfg(",".join(map(str, motions)), num_envs=4)
+    play_motions_once(cfg)
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    played, returns = [], []
+    for _ in range(2):
+        policy = Motions(env, fall=0.1)
+        result = evaluate_policy(RslRlVecEnvWrapper(env), policy, 11, seed=3)
+        returns.append(result.returns)
+        played.append(sum(policy.rounds, [])[:11])
+        assert 0.0 < result.failure_rate < 1.0
+    env.close()
+    # Eleven episodes of three motions, in rounds of four.
+    assert played[0] == [episode % 3 for episode in range(11)]
+    assert played[0] == played[1]
+    assert returns[0] == returns[1]
+
+
 def test_one_seed_gives_the_same_figures_and_another_one_others(short):
     one, same, other = (evaluated(short, seed=seed) for seed in (3, 3, 4))
     assert one.returns == same.returns
