@@ -20,7 +20,6 @@ from mjlab.rl.evaluation_result import (
     wilson_interval,
 )
 
-
 # 97.5 % of Student's t with three degrees of freedom, from a printed table.
 T95_OF_FOUR = 3.182446
 

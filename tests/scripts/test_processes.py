@@ -15,10 +15,10 @@ from process_runs import SMALL, Ended, ProcessRun
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from mjlab.rl.checkpoint import load_checkpoint
-from mjlab.utils.random import process_seed
 from mjlab.scripts.run_folder import checkpoints_in, read_run_info
 from mjlab.scripts.train_run import _build_env, parse_train_flags
 from mjlab.utils.processes import ProcessRank
+from mjlab.utils.random import process_seed
 
 
 @pytest.fixture(scope="module")

@@ -83,8 +83,8 @@ class EvaluationResult:
             notes.append("One episode gives no interval of a mean.")
         if self.num_episodes < _MANY_EPISODES:
             notes.append(
-                f"Below {_MANY_EPISODES} episodes, rare failures make intervals of means "
-                "optimistic: they may be missing. Judge failures by the interval of their rate."
+                f"Below {_MANY_EPISODES} episodes, rare failures may be missing, which makes the "
+                "intervals of means optimistic. Judge failures by the interval of their rate."
             )
         return tuple(notes)
 
@@ -113,7 +113,6 @@ class EvaluationResult:
                 f"An evaluation of this task has no figure {name!r}; it has {', '.join(known)}."
             )
         return float(value)
-
 
     def judged(self, name: str) -> float:
         """Return a figure as bounds judge it: rates by the middle of their Wilson interval.

@@ -43,12 +43,16 @@ def test_rounds_and_evaluations_leave_robots_on_the_terrain_where_they_began(mak
         terrain.env_origins.clone(),
     )
     assert kept[0].max() > 0
-    score(env, num_episodes=12)
+    levels = {"level": lambda env: terrain.terrain_levels.float()}
+    result = score(env, num_episodes=12, metrics=levels)
+    # In the second round they are where they were in the first.
+    assert result.metrics["level"].mean == pytest.approx(kept[0].float().mean().item())
     now = terrain.terrain_levels, terrain.terrain_types, terrain.env_origins
     for before, after in zip(kept, now, strict=True):
         assert torch.equal(before, after)
     # In training they do move: nobody got far.
     with torch.inference_mode():
+        env.step(torch.zeros(6, 12))
         env.reset()
     assert (terrain.terrain_levels < kept[0]).any()
     env.close()
