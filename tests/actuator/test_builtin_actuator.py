@@ -171,45 +171,23 @@ def test_dc_motor_by_physical_constants_is_the_same_motor(make_world):
     torch.testing.assert_close(*forces)
 
 
-def test_dc_motor_position_mode_gives_the_pd_torque_that_its_voltage_allows(make_world):
-    world = make_world(
-        BuiltinDcMotorActuatorCfg(
-            target_names_expr=JOINTS, motor_params=MOTOR, stiffness=10.0, damping=2.0,
-            voltage_limit=24.0, effort_limit=5.5,
-        )
-    )  # fmt: skip
-    world.set_state(POS, VEL)
-    world.entity.set_joint_position_target(TARGET)
-    wanted = 10.0 * (TARGET - POS) - 2.0 * VEL
-    volts = (3.84 / 0.8 * wanted + 0.8 * VEL).clamp(-24.0, 24.0)
-    assert (volts.abs() < 24.0).any()
-    assert (volts.abs() == 24.0).any()
-    expected = (0.8 * (volts - 0.8 * VEL) / 3.84).clamp(-5.5, 5.5)
-    torch.testing.assert_close(world.force(), expected, atol=1e-5, rtol=1e-5)
-
-
-def test_dc_motor_velocity_mode_reads_the_velocity_target(make_world):
-    world = make_world(
-        BuiltinDcMotorActuatorCfg(
-            target_names_expr=JOINTS, motor_params=MOTOR, mode=DcMotorInputMode.VELOCITY,
-            stiffness=1.0, damping=0.5, voltage_limit=24.0,
-        )
-    )  # fmt: skip
-    world.set_state(POS, VEL)
-    world.entity.set_joint_velocity_target(0.5 * VEL)
-    torch.testing.assert_close(world.force(), -0.25 * VEL - POS, atol=1e-5, rtol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("fields", "named"),
     [
         ({"mode": DcMotorInputMode.VOLTAGE, "stiffness": 1.0}, "stiffness=1.0"),
         ({"mode": DcMotorInputMode.POSITION, "voltage_limit": 24.0}, "stiffness=0.0"),
         ({"mode": DcMotorInputMode.VELOCITY, "stiffness": 1.0}, "voltage_limit=0.0"),
+        (
+            {
+                "mode": DcMotorInputMode.VELOCITY, "stiffness": 1.0, "voltage_limit": 24.0,
+                "integral_gain": 2.0,
+            },
+            "integral_gain=2.0",
+        ),
         ({"mode": 7, "stiffness": 1.0}, "mode=7"),
         ({"stiffness": 1.0, "voltage_limit": 24.0, "cogging": (1.0,)}, r"cogging=\(1.0,\)"),
     ],
-)
+)  # fmt: skip
 def test_dc_motor_refuses_figures_that_its_mode_does_not_have(fields, named):
     with pytest.raises(ValueError, match=named):
         BuiltinDcMotorActuatorCfg(target_names_expr=("hip",), motor_params=MOTOR, **fields)

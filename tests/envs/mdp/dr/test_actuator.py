@@ -94,26 +94,52 @@ def test_native_pd_writes_both_elements(make_world: Any) -> None:
     assert ranges == [[-6.0, 6.0], [-3.0, 3.0]]
 
 
-def test_dc_motor_gains(make_world: Any) -> None:
-    params = DcMotorDatasheetParams(nominal_voltage=24.0, stall_torque=5.0, no_load_speed=30.0)
+@pytest.mark.parametrize("mode", [DcMotorInputMode.POSITION, DcMotorInputMode.VELOCITY])
+@pytest.mark.parametrize("operation", ["scale", "abs"])
+def test_dc_motor_gains_are_randomized_in_volts(
+    make_world: Any, mode: DcMotorInputMode, operation: str
+) -> None:
     cfg = BuiltinDcMotorActuatorCfg(
-        target_names_expr=("hip",),
-        motor_params=params,
-        stiffness=12.0,
-        damping=1.0,
-        voltage_limit=24.0,
-    )
-    world = make_world(actuators=(cfg,))
-    world.apply(dr.pd_gains, kp_range=(2.0, 2.0), kd_range=(3.0, 3.0))
-    assert world.sim.model.actuator_gainprm[0, 0, 4] == 24.0
-    assert world.sim.model.actuator_gainprm[0, 0, 6] == 3.0
-    voltage = BuiltinDcMotorActuatorCfg(
-        target_names_expr=("hip",), motor_params=params, mode=DcMotorInputMode.VOLTAGE
-    )
-    with pytest.raises(ValueError, match=r"\['hip'\] are driven by voltage"):
-        make_world(actuators=(voltage,)).apply(
-            dr.pd_gains, kp_range=(1.0, 1.0), kd_range=(1.0, 1.0)
-        )
+        target_names_expr=("hip",), motor_params=MOTOR_PARAMS, mode=mode,
+        stiffness=2.0, damping=0.5, voltage_limit=24.0,
+    )  # fmt: skip
+    world, reset = make_world(actuators=(cfg,)), torch.tensor([1])
+    before = {"kp": 2.0, "kd": 0.5}
+    after = {"kp": 3.0, "kd": 0.25} if operation == "abs" else {"kp": 6.0, "kd": 0.125}
+    kp, kd = (3.0, 3.0), (0.25, 0.25)
+    for _ in range(2):
+        world.apply(dr.pd_gains, reset, kp_range=kp, kd_range=kd, operation=operation)
+    angle, speed, target = 0.2, 1.5, 0.9
+    expected = []
+    for gains in (before, after):
+        volts = gains["kp"] * (target - angle) - gains["kd"] * speed
+        if mode == DcMotorInputMode.VELOCITY:
+            volts = gains["kp"] * (target - speed)
+        # K = 0.8 and R = 0.384 of the data sheet.
+        expected.append(0.8 * (volts - 0.8 * speed) / 0.384)
+    torques = hip_torque(world, angle, speed, pos=target, vel=target)
+    assert torques == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({"mode": DcMotorInputMode.VOLTAGE}, r"\['hip'\] are driven by voltage"),
+        (
+            {
+                "mode": DcMotorInputMode.VELOCITY, "stiffness": 2.0, "voltage_limit": 24.0,
+                "slew_rate": 5.0,
+            },
+            r"\['hip'\] have a slew_rate",
+        ),
+    ],
+)  # fmt: skip
+def test_dc_motors_without_gains_to_randomize_are_refused(
+    make_world: Any, fields: dict[str, Any], named: str
+) -> None:
+    cfg = BuiltinDcMotorActuatorCfg(target_names_expr=("hip",), motor_params=MOTOR_PARAMS, **fields)
+    with pytest.raises(ValueError, match=named):
+        make_world(actuators=(cfg,)).apply(dr.pd_gains, kp_range=(1.0, 1.0), kd_range=(1.0, 1.0))
 
 
 def test_effort_limits_scale_both_ends(make_world: Any) -> None:
@@ -161,7 +187,13 @@ KINDS = {
     "scaled muscle": BuiltinMuscleActuatorCfg(**HIP, length_range=(-1.0, 1.0)),
     "pd": BuiltinPdActuatorCfg(**GAINS, effort_limit=5.0),
     "dc motor": BuiltinDcMotorActuatorCfg(
-        **GAINS, motor_params=MOTOR_PARAMS, voltage_limit=24.0, effort_limit=5.0
+        **HIP,
+        # Times K/R = 0.8 / 0.384 these are the gains of the others.
+        stiffness=3.84,
+        damping=0.72,
+        motor_params=MOTOR_PARAMS,
+        voltage_limit=24.0,
+        effort_limit=5.0,
     ),
     "voltage": BuiltinDcMotorActuatorCfg(
         **HIP, motor_params=MOTOR_PARAMS, mode=DcMotorInputMode.VOLTAGE, effort_limit=5.0
@@ -208,8 +240,9 @@ def test_gains_and_effort_limits_of_every_kind_act_on_the_joint(
     if kind != "velocity":
         torques = hip_torque(world, 0.0, 0.0, pos=0.1, vel=0.0, effort=0.0)
         assert torques == pytest.approx([0.8, 1.6], rel=1e-4)
-    torques = hip_torque(world, 0.0, 0.5, pos=0.0, vel=0.0, effort=0.0)
-    assert torques == pytest.approx([-0.75, -2.25], rel=1e-4)
+    torques = hip_torque(world, 0.0, 0.4, pos=0.0, vel=0.0, effort=0.0)
+    back_emf = 0.4 * 0.8**2 / 0.384 if kind == "dc motor" else 0.0
+    assert torques == pytest.approx([-0.6 - back_emf, -1.8 - back_emf], rel=1e-4)
 
 
 def test_only_scale_and_abs_are_known(make_world: Any) -> None:

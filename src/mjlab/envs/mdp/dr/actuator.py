@@ -73,9 +73,6 @@ _SERVO_GAINS = Gains(
 _VELOCITY_GAINS = Gains(
     kp=(), kd=(Place("actuator_gainprm", 0, 1.0), Place("actuator_biasprm", 2, -1.0))
 )
-_DC_MOTOR_GAINS = Gains(
-    kp=(Place("actuator_gainprm", 4, 1.0),), kd=(Place("actuator_gainprm", 6, 1.0),)
-)
 # Two MuJoCo actuators a target: the first follows the position, the second the velocity.
 _PD_GAINS = Gains(
     kp=(Place("actuator_gainprm", 0, 1.0, 0), Place("actuator_biasprm", 1, -1.0, 0)),
@@ -108,19 +105,21 @@ def pd_gains(
 ) -> None:
     """Randomize stiffness and damping of actuators that have them.
 
-    Of velocity servos only the damping changes. Gains are drawn independently per environment and actuator: for each actuator config first all
+    Of velocity servos only the damping changes, of DC motors in velocity mode only the stiffness.
+    Gains are drawn independently per environment and actuator: for each actuator config first all
     stiffnesses, then all dampings.
 
     Args:
         env_ids: Environments to change; None means all.
-        kp_range: Stiffness (N m/rad or N/m), or its factor with "scale".
-        kd_range: Damping (N m s/rad or N s/m), or its factor with "scale".
+        kp_range: Stiffness in the units of the actuator's config, or its factor with "scale".
+        kd_range: Damping in the units of the actuator's config, or its factor with "scale".
         asset_cfg: Entity and actuators, each selected by its own name or index.
         distribution: "uniform", "log_uniform", or a `Distribution`.
         operation: "scale" multiplies the configured gains, "abs" replaces them.
 
     Raises:
-        ValueError: another operation, or a DC motor that is driven by voltage.
+        ValueError: another operation, or a DC motor that is driven by voltage or, in velocity mode,
+            has a slew rate.
         TypeError: a selected actuator has no gains: motors and muscles have none.
     """
     dist, op = resolve_distribution(distribution), _scale_or_abs(operation, "pd_gains")
@@ -129,8 +128,11 @@ def pd_gains(
     places = [_gain_places(selected.actuator) for selected in chosen]
     for selected, gains in zip(chosen, places, strict=True):
         kp, kd = (selected.draw(dist, pair, env.device) for pair in bounds)
-        if gains is None:
+        if isinstance(selected.actuator, IdealPdActuator):
             _set_ideal_gains(selected, op, kp, kd)
+            continue
+        if isinstance(selected.actuator, BuiltinDcMotorActuator):
+            _set_dc_motor_gains(env, selected, op, kp, kd)
             continue
         for samples, targets in ((kp, gains.kp), (kd, gains.kd)):
             for place in targets:
@@ -184,10 +186,10 @@ def effort_limits(
             _write(env, selected.rows, columns, place, op, values)
 
 
-def _gain_places(actuator: Actuator) -> Gains | None:
-    """Return where an actuator's gains are in the model; None if it keeps them itself."""
+def _gain_places(actuator: Actuator) -> Gains:
+    """Return where an actuator's gains are in the model; nowhere if they are not there as such."""
     if isinstance(actuator, IdealPdActuator):
-        return None
+        return Gains((), ())
     if isinstance(actuator, BuiltinPdActuator):
         return _PD_GAINS
     if isinstance(actuator, BuiltinDcMotorActuator):
@@ -196,7 +198,13 @@ def _gain_places(actuator: Actuator) -> Gains | None:
                 f"pd_gains: the DC motors {list(actuator.target_names)} are driven by voltage and "
                 "have no gains. Select other actuators, or use position or velocity mode."
             )
-        return _DC_MOTOR_GAINS
+        if actuator.cfg.mode == DcMotorInputMode.VELOCITY and actuator.cfg.slew_rate > 0.0:
+            raise ValueError(
+                f"pd_gains: the DC motors {list(actuator.target_names)} have a slew_rate in "
+                "velocity mode, which MuJoCo scales with their gain. Select other actuators, or "
+                "set slew_rate to 0."
+            )
+        return Gains((), ())
     if _reads(actuator, "position", BuiltinPositionActuator):
         return _SERVO_GAINS
     if _reads(actuator, "velocity", BuiltinVelocityActuator):
@@ -326,6 +334,36 @@ def _write(
     else:
         samples = place.sign * samples
     model_field(env, place.field)[rows[:, None], columns[None, :], place.axis] = samples
+
+
+def _set_dc_motor_gains(
+    env: ManagerBasedRlEnv,
+    selected: SelectedActuator,
+    op: Operation,
+    kp: torch.Tensor,
+    kd: torch.Tensor,
+) -> None:
+    """Write gains in volts to MuJoCo's gains in torque; see `BuiltinDcMotorActuator`.
+
+    A gain g on the speed is stored as (g + K) K/R, one on the position as g K/R.
+    """
+    columns = selected.elements[0]
+
+    def default(axis: int) -> torch.Tensor:
+        return _default(env, selected.rows, columns, "actuator_gainprm", axis)
+
+    resistance, constant = default(0), default(1)
+    torque_per_volt, back_emf = constant / resistance, constant**2 / resistance
+    if selected.actuator.cfg.mode == DcMotorInputMode.VELOCITY:
+        written = ((6, back_emf, kp),)
+    else:
+        written = ((4, torch.zeros_like(back_emf), kp), (6, back_emf, kd))
+    for axis, offset, samples in written:
+        unit = default(axis) - offset if op is SCALE else torque_per_volt
+        values = offset + unit * samples
+        model_field(env, "actuator_gainprm")[selected.rows[:, None], columns[None, :], axis] = (
+            values
+        )
 
 
 def _set_ideal_gains(
