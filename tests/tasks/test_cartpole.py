@@ -108,3 +108,10 @@ def test_the_pole_angle_has_the_period_of_a_turn(env):
     put(env, np.zeros((NUM_ENVS, 2)) + [0.0, 0.7 + 2 * math.pi], np.zeros((NUM_ENVS, 2)), 0.0)
     torch.testing.assert_close(task.pole_angle_cos_sin(env, **params), once)
     torch.testing.assert_close(once[0], torch.tensor([math.cos(0.7), math.sin(0.7)]))
+
+
+def test_the_cart_of_the_swing_up_starts_anywhere_near_the_middle(env):
+    env.reset()
+    cart = env.sim.data.qpos[:, 0]
+    assert -0.1 <= cart.min() < -0.05
+    assert 0.05 < cart.max() <= 0.1

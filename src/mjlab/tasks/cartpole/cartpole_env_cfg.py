@@ -163,7 +163,7 @@ def _observations(corrupted: bool) -> dict[str, ObservationGroupCfg | None]:
     }
 
 
-def _reset_events(slider_range: tuple[float, float]) -> dict[str, EventTermCfg | None]:
+def _reset_events() -> dict[str, EventTermCfg | None]:
     def reset(joint: str, position_range: tuple[float, float]) -> EventTermCfg:
         return EventTermCfg(
             func=reset_joints_by_offset,
@@ -176,7 +176,7 @@ def _reset_events(slider_range: tuple[float, float]) -> dict[str, EventTermCfg |
         )
 
     return {
-        "reset_slider": reset("slider", slider_range),
+        "reset_slider": reset("slider", (-0.1, 0.1)),
         "reset_hinge": reset("hinge_1", (-0.034, 0.034)),
     }
 
@@ -195,7 +195,7 @@ def _make_env_cfg(swing_up: bool, play: bool) -> ManagerBasedRlEnvCfg:
                 entity_name="cartpole", actuator_names=("slider",), scale=1.0
             ),
         },
-        events=_reset_events(slider_range=(0.0, 0.0) if swing_up else (-0.1, 0.1)),
+        events=_reset_events(),
         rewards={
             "smooth_reward": RewardTermCfg(
                 func=cartpole_smooth_reward,
