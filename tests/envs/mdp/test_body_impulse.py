@@ -66,6 +66,29 @@ def test_a_viz_cfg_is_accepted_and_used(make_world: Any) -> None:
     assert color == (0.0, 1.0, 0.0, 1.0)
 
 
+def test_drawing_defaults_are_those_of_the_interface(make_world: Any) -> None:
+    viz = apply_body_impulse.VizCfg()
+    assert (viz.rgba, viz.scale, viz.width, viz.min_force) == (
+        (0.9, 0.2, 0.8, 0.9), 0.005, 0.015, 1.0,
+    )  # fmt: skip
+    assert apply_body_impulse.VizCfg((0.0, 0.0, 1.0, 1.0), 0.1).scale == 0.1
+    world = make_world()
+    # Forces of 2 N on each axis, and of 0.5 N, which is below what is drawn.
+    for force, count in ((2.0, 4), (0.5, 0)):
+        manager = make_term(world, force_range=(force, force))
+        run(world, manager, 5)
+        arrows: list[Any] = []
+        visualizer = SimpleNamespace(
+            get_env_indices=range,
+            add_arrow=lambda *args, width, drawn=arrows: drawn.append((*args, width)),
+        )
+        manager.get_term_cfg("impulse").func.debug_vis(visualizer)
+        assert len(arrows) == count
+        for start, end, color, width in arrows:
+            assert (end - start).tolist() == pytest.approx([0.01] * 3)
+            assert (color, width) == (viz.rgba, viz.width)
+
+
 def test_weak_and_inactive_impulses_are_not_drawn(make_world: Any) -> None:
     world = make_world()
     drawn: list[Any] = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -23,30 +23,6 @@ if TYPE_CHECKING:
 _TIME_MARGIN = 1e-6
 
 
-@dataclass(frozen=True)
-class ImpulseVizCfg:
-    """How active impulses are drawn."""
-
-    scale: float = 0.01
-    """Length of an arrow per force (m/N)."""
-    min_force: float = 0.1
-    """Forces below this (N) are not drawn."""
-    width: float = 0.015
-    """Width of an arrow (m)."""
-    rgba: tuple[float, float, float, float] = (0.9, 0.2, 0.2, 0.8)
-    """Colour of an arrow."""
-
-    @classmethod
-    def read(cls, given: Any) -> ImpulseVizCfg:
-        """Take the fields that `given` (None, a mapping or any object with attributes) has."""
-        names = cls.__dataclass_fields__
-        if given is None:
-            return cls()
-        if isinstance(given, Mapping):
-            return cls(**{name: given[name] for name in names if name in given})
-        return cls(**{name: getattr(given, name) for name in names if hasattr(given, name)})
-
-
 @stateful
 class apply_body_impulse:
     """Pushes bodies with random wrenches, each environment on timers of its own (mode "step").
@@ -62,8 +38,21 @@ class apply_body_impulse:
         asset_cfg: Entity and bodies.
         body_point_offset: Where the force acts, relative to the body's centre of mass, in the
             frame of the body's link; this adds a torque. The centre of mass by default.
-        viz_cfg: Drawing of active impulses: a mapping or object with fields of `ImpulseVizCfg`.
+        viz_cfg: Drawing of active impulses: a mapping or object with fields of `VizCfg`.
     """
+
+    @dataclass
+    class VizCfg:
+        """Drawing of active impulses, one arrow a body."""
+
+        rgba: tuple[float, float, float, float] = (0.9, 0.2, 0.8, 0.9)
+        """Color of an arrow."""
+        scale: float = 0.005
+        """Length of an arrow per force (m/N)."""
+        width: float = 0.015
+        """Width of an arrow (m)."""
+        min_force: float = 1.0
+        """Smallest force that is drawn (N)."""
 
     _transient = {"_asset", "_viz", "_bodies", "_num_bodies", "_cooldown_s", "_offset"}
 
@@ -76,7 +65,7 @@ class apply_body_impulse:
         self._num_bodies = num_selected(self._asset_cfg.body_ids, self._asset.num_bodies)
         self._cooldown_s = tuple(params["cooldown_s"])
         self._offset = params.get("body_point_offset")
-        self._viz = ImpulseVizCfg.read(params.get("viz_cfg"))
+        self._viz = self._read_viz_cfg(params.get("viz_cfg"))
         self._remaining = torch.zeros(env.num_envs, device=env.device)
         self._active = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
         self._cooldown = sample_uniform(*self._cooldown_s, (env.num_envs,), env.device)
@@ -139,6 +128,14 @@ class apply_body_impulse:
                 if (vector @ vector) ** 0.5 >= self._viz.min_force:
                     end = begin + vector * self._viz.scale
                     visualizer.add_arrow(begin, end, self._viz.rgba, width=self._viz.width)
+
+    @classmethod
+    def _read_viz_cfg(cls, given: Any) -> VizCfg:
+        """Take the fields that `given` (None, a mapping or any object with attributes) has."""
+        names = [field.name for field in fields(cls.VizCfg)]
+        if isinstance(given, Mapping):
+            return cls.VizCfg(**{name: given[name] for name in names if name in given})
+        return cls.VizCfg(**{name: getattr(given, name) for name in names if hasattr(given, name)})
 
     def _arms(self, ids: torch.Tensor, offset: tuple[float, float, float]) -> torch.Tensor:
         """Return the offset in world axes, (K, bodies, 3)."""
