@@ -132,6 +132,18 @@ def test_a_slow_turn_is_even(tmp_path):
     np.testing.assert_allclose(rates[:, 2], 0.05, rtol=1e-6)
 
 
+def test_angular_velocities_are_those_of_an_accelerating_turn():
+    """Differences over 2 dt are exact for a constant acceleration; both ends repeat a neighbor."""
+    dt, axis = 0.02, np.array([0.3, -0.4, 0.8]) / np.linalg.norm([0.3, -0.4, 0.8])
+    t = np.arange(40)[:, None] * dt
+    half, rate = 0.5 * (0.7 * t + 1.5 * t**2), 0.7 + 3.0 * t
+    turn = np.hstack((np.cos(half), np.sin(half) * axis))
+    expected = rate[[1, *range(1, 39), 38]] * axis
+    np.testing.assert_allclose(angular_velocities(turn, dt), expected, atol=1e-9)
+    two = angular_velocities(turn[:2], dt)
+    np.testing.assert_allclose(two, 0.5 * (rate[:1] + rate[1:2]) * axis * [[1.0], [1.0]], atol=1e-9)
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     angle=st.one_of(st.floats(1e-9, 1e-3), st.floats(1e-3, 3.1)),

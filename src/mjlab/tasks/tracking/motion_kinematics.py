@@ -96,8 +96,9 @@ def make_motion(
 ) -> Motion:
     """Return the motion of a recording: velocities, and poses and velocities of all bodies.
 
-    Velocities of the root and of the joints are central differences (one-sided at both ends), and
-    those of the bodies follow from them.
+    Velocities of the root and of the joints are central differences, and those of the bodies follow
+    from them. At both ends linear and joint velocities are one-sided differences, and the angular
+    velocity of the root is that of the neighboring pose, as release 1.6 of the interface has them.
 
     Args:
         recording: At least two poses.
@@ -151,15 +152,13 @@ def recording_of(motion: Motion, fps: float) -> Recording:
 def angular_velocities(quats: np.ndarray, dt: float) -> np.ndarray:
     """Return the angular velocities (T, 3), in world axes, of orientations (T, 4) dt apart.
 
-    log(q_(t+1) q_(t-1)*) / (2 dt); at both ends, from the one neighbour there is.
+    log(q_(t+1) q_(t-1)*) / (2 dt). The first and the last are those of their neighbors; of two
+    orientations, both are the one difference.
     """
-    if len(quats) < 2:
-        return np.zeros((len(quats), 3))
-    ends = np.empty((len(quats), 3))
-    ends[0] = _rotation_vectors(quats[:1], quats[1:2])[0] / dt
-    ends[-1] = _rotation_vectors(quats[-2:-1], quats[-1:])[0] / dt
-    ends[1:-1] = _rotation_vectors(quats[:-2], quats[2:]) / (2.0 * dt)
-    return ends
+    if len(quats) < 3:
+        return np.repeat(_rotation_vectors(quats[:-1], quats[1:]) / dt, len(quats), axis=0)
+    inner = _rotation_vectors(quats[:-2], quats[2:]) / (2.0 * dt)
+    return np.concatenate((inner[:1], inner, inner[-1:]))
 
 
 def _rotation_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
