@@ -14,12 +14,14 @@ from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import ObservationTermCfg, SceneEntityCfg
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
 from mjlab.scripts.train_run import parse_train_flags
+from mjlab.sensor import BuiltinSensorCfg, GridPatternCfg, ObjRef, RayCastSensorCfg
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.tasks.velocity import mdp
 from mjlab.tasks.velocity.mirror import mirror_of_joints
 from mjlab.tasks.velocity.symmetry import mirror_left_right
 
 FLAT_GO1 = "Mjlab-Velocity-Flat-Unitree-Go1"
+ROUGH_GO1 = "Mjlab-Velocity-Rough-Unitree-Go1"
 FLAT_G1 = "Mjlab-Velocity-Flat-Unitree-G1"
 # Height of the root (m) at which feet just touch the ground.
 FALLING = {FLAT_GO1: 0.27, FLAT_G1: 0.74}
@@ -48,16 +50,22 @@ def mirrored_rows(env, actions):
     return mirror_left_right(env, actions=actions)[1]
 
 
-def put_before_mirror(env, height):
-    """Give environment 0 a random state and environment 1 its mirror image."""
+def put_before_mirror(env, height, turning=0.1, left=0.0):
+    """Give environment 0 a random state and environment 1 its mirror image.
+
+    Args:
+        env: The environments.
+        height: Height of the roots (m).
+        turning: Size of the angular velocity (rad/s).
+        left: Distance of environment 0 from the mirror (m).
+    """
     robot = env.scene["robot"]
     pose = robot.data.default_root_state[:, :7].clone()
-    pose[:, :3] = env.scene.env_origins + torch.tensor([0.0, 0.0, height])
+    pose[:, :3] = env.scene.env_origins + torch.tensor([[0.0, left, height], [0.0, -left, height]])
     upright = torch.tensor([1.0, 0.0, 0.0, 0.0])
     quat = torch.nn.functional.normalize(upright + 0.1 * torch.randn(4), dim=0)
     pose[0, 3:], pose[1, 3:] = quat, quat * torch.tensor([1.0, -1.0, 1.0, -1.0])
-    # Slow turns, because the gauge of velocity (the IMU) is not in the middle of the Go1.
-    velocity = (torch.randn(6) * torch.tensor([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])).repeat(2, 1)
+    velocity = (torch.randn(6) * torch.tensor([1.0] * 3 + [turning] * 3)).repeat(2, 1)
     velocity[1] *= torch.tensor([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
     # Actions and joints are in the same order, and both measured from the default pose.
     offsets = mirrored_rows(env, 0.1 * torch.randn(1, len(robot.joint_names)))
@@ -112,8 +120,58 @@ def test_the_mirror_image_is_what_a_mirrored_robot_senses(task):
     env.close()
 
 
+def a_step_to_climb(cfg):
+    """Give all environments one place, a low box across the mirror, and a scan of the ground."""
+
+    def add_box(spec):
+        box = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.3, 0.2, 0.2))
+        box.pos, box.group = (0.3, 0.0, 0.0), 0
+
+    cfg.scene.spec_fn, cfg.scene.env_spacing = add_box, 0.0
+
+
+@pytest.mark.parametrize("task", [FLAT_GO1, FLAT_G1, ROUGH_GO1])
+def test_every_term_is_mirrored_exactly_while_the_robot_turns_fast(task):
+    """At 10 rad/s the IMU of the Go1, 67 mm from the middle, moves at up to 0.7 m/s by turning."""
+    env = make_env(task, a_step_to_climb if task == ROUGH_GO1 else None)
+    torch.manual_seed(1)
+    turns = {}
+    for _ in range(4):
+        # As after a step, but without physics: masses of the two sides differ by some grams.
+        put_before_mirror(env, 1.1, turning=10.0, left=0.15)
+        seen = TensorDict(env.observation_manager.compute(update_history=True), batch_size=[2])
+        both, _ = mirror_left_right(env, seen)
+        for group, values in seen.items():
+            for name, columns in term_columns(env, group):
+                image, other = both[group][2, columns], values[1, columns]
+                torch.testing.assert_close(
+                    image, other, atol=1e-4, rtol=1e-4, msg=f"{group}/{name}"
+                )
+                turn = (values[0, columns] - other).abs().max().item()
+                turns[name] = max(turn, turns.get(name, 0.0))
+    still = {"actions", "foot_air_time", "foot_contact", "foot_contact_forces"}
+    assert {name for name, turn in turns.items() if turn < 0.01} <= still
+    env.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_mirror_image_is_exact_after_steps_of_fast_turns_in_the_air(task):
+    env = make_env(task)
+    torch.manual_seed(2)
+    put_before_mirror(env, 1.5, turning=8.0)
+    for _ in range(3):
+        action = mirrored_rows(env, 0.3 * torch.randn(1, len(env.scene["robot"].joint_names)))
+        seen = TensorDict(env.step(action)[0], batch_size=[2])
+    both, _ = mirror_left_right(env, seen)
+    for name, columns in term_columns(env, "actor"):
+        gap = (both["actor"][2, columns] - seen["actor"][1, columns]).abs().max()
+        # What the masses of the two sides make of it within 0.06 s.
+        assert gap < (0.5 if name == "joint_vel" else 0.05), (name, gap)
+    env.close()
+
+
 def test_rays_to_the_left_are_rays_to_the_right_in_the_mirror():
-    env = make_env("Mjlab-Velocity-Rough-Unitree-Go1")
+    env = make_env(ROUGH_GO1)
     offsets, _ = env.scene["terrain_scan"].cfg.pattern.generate_rays(None, "cpu")
     seen = TensorDict(env.observation_manager.compute(), batch_size=[2])
     (columns,) = [c for name, c in term_columns(env, "actor") if name == "height_scan"]
@@ -121,6 +179,26 @@ def test_rays_to_the_left_are_rays_to_the_right_in_the_mirror():
         seen["actor"][:, columns] = offsets[:, axis]
         image = mirror_left_right(env, seen)[0]["actor"][2:, columns]
         torch.testing.assert_close(image, sign * offsets[:, axis].expand(2, -1))
+    env.close()
+
+
+def other_scales(cfg):
+    terms = cfg.observations["actor"].terms
+    terms["base_lin_vel"].scale, terms["base_ang_vel"].scale = 2.0, 0.25
+
+
+def the_root_s_own_turn(cfg):
+    cfg.observations["actor"].terms["base_ang_vel"] = ObservationTermCfg(func=mdp.base_ang_vel)
+
+
+@pytest.mark.parametrize("edit", [other_scales, the_root_s_own_turn])
+def test_the_lever_arm_is_mirrored_from_whatever_shows_the_turn(edit):
+    env = make_env(FLAT_GO1, edit)
+    torch.manual_seed(3)
+    put_before_mirror(env, 1.1, turning=10.0)
+    seen = TensorDict(env.observation_manager.compute(update_history=True), batch_size=[2])
+    image = mirror_left_right(env, seen)[0]["actor"][2, :6]
+    torch.testing.assert_close(image, seen["actor"][1, :6], atol=1e-4, rtol=1e-4)
     env.close()
 
 
@@ -152,6 +230,48 @@ def a_selection_of_joints(cfg):
 
 def a_history(cfg):
     cfg.observations["actor"].terms["projected_gravity"].history_length = 3
+
+
+def no_angular_velocity(cfg):
+    del cfg.observations["actor"].terms["base_ang_vel"]
+
+
+def an_angular_velocity_of_another_time(cfg):
+    cfg.observations["critic"].terms["base_ang_vel"].delay_max_lag = 2
+
+
+def an_accelerometer_on_one_side(cfg):
+    sensor = BuiltinSensorCfg(
+        name="acceleration",
+        sensor_type="accelerometer",
+        obj=ObjRef(type="site", name="imu", entity="robot"),
+    )
+    cfg.scene.sensors += (sensor,)
+    cfg.observations["actor"].terms["acceleration"] = ObservationTermCfg(
+        func=mdp.builtin_sensor, params={"sensor_name": "robot/acceleration"}
+    )
+
+
+def a_gyro_on_a_leg(cfg):
+    sensor = BuiltinSensorCfg(
+        name="turn", sensor_type="gyro", obj=ObjRef(type="site", name="FL", entity="robot")
+    )
+    cfg.scene.sensors += (sensor,)
+    cfg.observations["actor"].terms["turn"] = ObservationTermCfg(
+        func=mdp.builtin_sensor, params={"sensor_name": "robot/turn"}
+    )
+
+
+def rays_from_one_side(cfg):
+    scan = RayCastSensorCfg(
+        name="scan",
+        frame=ObjRef(type="site", name="imu", entity="robot"),
+        pattern=GridPatternCfg(size=(0.2, 0.2), resolution=0.1),
+    )
+    cfg.scene.sensors += (scan,)
+    cfg.observations["actor"].terms["scan"] = ObservationTermCfg(
+        func=mdp.height_scan, params={"sensor_name": "scan"}
+    )
 
 
 def a_pose_that_leans(cfg):
@@ -205,6 +325,11 @@ def rays_from_two_frames(cfg):
         (joints_in_an_order_of_their_own, "without preserve_order"),
         (actions_of_one_side, "joints of one side only"),
         (a_stronger_left, "another scale on the left"),
+        (no_angular_velocity, "actor/base_lin_vel is the velocity of a point -0.0666 m"),
+        (an_angular_velocity_of_another_time, "critic/base_lin_vel .*the same fixed one"),
+        (an_accelerometer_on_one_side, "Accelerometer 'robot/acceleration' .*-0.0666 m"),
+        (a_gyro_on_a_leg, "'robot/turn' is on body 'robot/FL_calf'"),
+        (rays_from_one_side, "'scan' are not the same on both sides"),
         (rays_from_two_frames, "'foot_height_scan' are not the same on both sides"),
         (a_pose_that_leans, "Joint 'FR_hip_joint' is not the mirror image of 'FL_hip_joint'"),
     ],

@@ -7,7 +7,7 @@ axes of rotation those of x and z.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import torch
@@ -18,16 +18,34 @@ ROTATION = (-1.0, 1.0, -1.0)
 _SIDES = {"left": "right", "FL": "FR", "RL": "RR"}
 _OTHER_SIDE = _SIDES | {right: left for left, right in _SIDES.items()}
 # By how much partners may differ: axes (unit vectors), default positions (rad), places (m).
-_AXIS_TOLERANCE, _POSE_TOLERANCE, _PLACE_TOLERANCE = 1e-4, 1e-3, 5e-3
+_AXIS_TOLERANCE, _POSE_TOLERANCE, PLACE_TOLERANCE = 1e-4, 1e-3, 5e-3
 WITHOUT = "To learn without mirror images, set agent.algorithm.symmetry_cfg to None."
 
 
-class Mirror:
-    """What a vector of numbers is in the mirror: number i is `signs[i]` times number `sources[i]`."""
+class Coupling(NamedTuple):
+    """A share of one number in the mirror image of another."""
 
-    def __init__(self, sources: Sequence[int], signs: Sequence[float]) -> None:
+    target: int
+    """Number of the image."""
+    source: int
+    """Number that is read."""
+    factor: float
+
+
+class Mirror:
+    """Mirror image of a vector of numbers.
+
+    Number i is `signs[i]` times number `sources[i]`, and what the couplings of i add.
+    """
+
+    def __init__(
+        self, sources: Sequence[int], signs: Sequence[float], couplings: Sequence[Coupling] = ()
+    ) -> None:
         """Take indices and signs, of one length."""
         self.sources, self.signs = torch.tensor(sources), torch.tensor(signs)
+        self._targets = torch.tensor([coupling.target for coupling in couplings]).long()
+        self._read = torch.tensor([coupling.source for coupling in couplings]).long()
+        self._factors = torch.tensor([coupling.factor for coupling in couplings])
 
     def __len__(self) -> int:
         return len(self.signs)
@@ -35,18 +53,22 @@ class Mirror:
     def __call__(self, values: torch.Tensor) -> torch.Tensor:
         """Return the mirror image of `values` (N, numbers)."""
         if self.signs.device != values.device:
-            self.sources, self.signs = self.sources.to(values.device), self.signs.to(values.device)
-        return values[:, self.sources] * self.signs
+            for name in ("sources", "signs", "_targets", "_read", "_factors"):
+                setattr(self, name, getattr(self, name).to(values.device))
+        image = values[:, self.sources] * self.signs
+        if len(self._targets):
+            image.index_add_(1, self._targets, values[:, self._read] * self._factors)
+        return image
 
     @staticmethod
-    def joined(mirrors: Sequence[Mirror]) -> Mirror:
-        """Return the mirror of vectors that stand one behind the other."""
+    def joined(mirrors: Sequence[Mirror], couplings: Sequence[Coupling] = ()) -> Mirror:
+        """Return the mirror of vectors that stand one behind the other, coupled as given."""
         sources: list[int] = []
         signs: list[float] = []
         for mirror in mirrors:
             sources += [len(signs) + source for source in mirror.sources.tolist()]
             signs += mirror.signs.tolist()
-        return Mirror(sources, signs)
+        return Mirror(sources, signs, couplings)
 
 
 def partners(names: Sequence[str]) -> list[int]:
@@ -89,7 +111,7 @@ def mirror_of_joints(model: mujoco.MjModel, robot: Any) -> Mirror:
     for i, partner in enumerate(pairs):
         if (
             abs(abs(signs[i]) - 1) > _AXIS_TOLERANCE
-            or apart[i] > _PLACE_TOLERANCE
+            or apart[i] > PLACE_TOLERANCE
             or abs(pose[i] - signs[i] * pose[partner]) > _POSE_TOLERANCE
         ):
             raise ValueError(

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from itertools import accumulate
+from typing import TYPE_CHECKING, Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import mujoco
@@ -21,8 +22,10 @@ from mjlab.envs import mdp as envs_mdp
 from mjlab.tasks.velocity import mdp
 from mjlab.tasks.velocity.mirror import (
     DIRECTION,
+    PLACE_TOLERANCE,
     ROTATION,
     WITHOUT,
+    Coupling,
     Mirror,
     mirror_of_joints,
     other_side,
@@ -95,11 +98,13 @@ def _build(env: ManagerBasedRlEnv) -> _Mirrors:
                 f"takes groups that are one tensor. {WITHOUT}"
             )
         shapes = manager.group_obs_term_dim[group]
-        terms = [
-            _mirror_of_term(env, group, name, shape)
+        terms = {
+            name: _mirror_of_term(env, group, name, shape)
             for name, shape in zip(names, shapes, strict=True)
-        ]
-        groups[group] = Mirror.joined(terms)
+        }
+        starts = accumulate(map(len, terms.values()), initial=0)
+        couplings = _lever_arms(env, group, dict(zip(terms, starts, strict=False)))
+        groups[group] = Mirror.joined(list(terms.values()), couplings)
     return _Mirrors(groups, _of_actions(env))
 
 
@@ -140,26 +145,134 @@ def _rotation(*_: Any) -> Mirror:
     return Mirror(range(3), ROTATION)
 
 
+class _Sensor(NamedTuple):
+    """A sensor at a site."""
+
+    name: str
+    kind: mujoco.mjtSensor
+    body: int
+    """Id of the body that carries it."""
+    y: float
+    """Distance from the mirror plane (m), positive to the left."""
+
+
 def _of_sensor(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
-    """Return the mirror of a gyro or the like, which stands at a site turned as the root is."""
-    name, model = params["sensor_name"], env.sim.mj_model
+    """Return the mirror of a gyro or the like, apart from the lever arm of its place."""
+    sensor = _sensor(env, params["sensor_name"])
+    is_off = abs(sensor.y) > PLACE_TOLERANCE
+    if sensor.kind == mujoco.mjtSensor.mjSENS_ACCELEROMETER and is_off:
+        raise ValueError(
+            f"Accelerometer {sensor.name!r} stands {sensor.y:.3g} m to the left of the middle. What "
+            "it reads in the mirror depends on the angular acceleration, which is not observed; "
+            f"place it in the middle. {WITHOUT}"
+        )
+    return Mirror(range(3), _OF_SENSOR[sensor.kind])
+
+
+def _sensor(env: ManagerBasedRlEnv, name: str) -> _Sensor:
+    """Return a gyro, velocimeter or accelerometer at a site that is turned as the root is."""
+    model = env.sim.mj_model
     found = model.sensor(name)
-    signs = _OF_SENSOR.get(mujoco.mjtSensor(int(found.type.item())))
-    if signs is None:
+    kind, site = mujoco.mjtSensor(int(found.type.item())), int(found.objid.item())
+    if kind not in _OF_SENSOR:
         raise ValueError(
             f"mirror_left_right knows gyros, velocimeters and accelerometers; sensor {name!r} is "
             f"none of these. {WITHOUT}"
         )
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    root: Any = env.scene[_ROBOT]
-    turned = data.site_xmat[int(found.objid.item())] - data.xmat[root.indexing.root_body_id]
-    if np.abs(turned).max() > _TOLERANCE:
+    data, root = _reference_pose(env)
+    body = int(model.site_bodyid[site])
+    if np.abs(data.site_xmat[site] - data.xmat[root]).max() > _TOLERANCE:
         raise ValueError(
             f"Sensor {name!r} is turned against the robot's root, so mirror_left_right does not know "
             f"which of its axes points to the left. {WITHOUT}"
         )
-    return Mirror(range(3), signs)
+    carrier = model.body(body).name
+    if other_side(carrier.split("/")[-1]) != carrier.split("/")[-1]:
+        raise ValueError(
+            f"Sensor {name!r} is on body {carrier!r}, on one side of the robot; expected a body in "
+            f"the middle. {WITHOUT}"
+        )
+    return _Sensor(name, kind, body, _to_left(data, root, data.site_xpos[site]))
+
+
+def _reference_pose(env: ManagerBasedRlEnv) -> tuple[mujoco.MjData, int]:
+    """Return the kinematics at `qpos0`, and the id of the robot's root."""
+    data = mujoco.MjData(env.sim.mj_model)
+    mujoco.mj_kinematics(env.sim.mj_model, data)
+    robot: Any = env.scene[_ROBOT]
+    return data, robot.indexing.root_body_id
+
+
+def _to_left(data: mujoco.MjData, root: int, point: np.ndarray) -> float:
+    """Return the distance of a point from the mirror plane of the body `root` (m)."""
+    return float((point - data.xpos[root]) @ data.xmat[root].reshape(3, 3)[:, 1])
+
+
+def _lever_arms(env: ManagerBasedRlEnv, group: str, starts: dict[str, int]) -> list[Coupling]:
+    """Return what the angular velocity adds to the mirror images of linear velocities.
+
+    The mirror image of a sensor at distance y from the mirror plane is at distance -y, where the
+    mirrored robot has none: its own reads, for w' the mirrored angular velocity,
+
+        v' = S v + w' x (0, 2 y, 0) = S v + 2 y (w_z, 0, -w_x).
+
+    Args:
+        env: The environment.
+        group: Name of the observation group.
+        starts: First column of each of its terms.
+
+    Raises:
+        ValueError: the group does not observe the angular velocity that is needed.
+    """
+    configs: Any = env.cfg.observations
+    terms = {name: configs[group].terms[name] for name in starts}
+    sensors = {
+        name: _sensor(env, cfg.params["sensor_name"])
+        for name, cfg in terms.items()
+        if cfg.func is envs_mdp.builtin_sensor
+    }
+    turning = {n: s.body for n, s in sensors.items() if s.kind == mujoco.mjtSensor.mjSENS_GYRO}
+    for name, cfg in terms.items():
+        if cfg.func is envs_mdp.base_ang_vel:
+            turning[name] = _reference_pose(env)[1]
+    couplings = []
+    for name, sensor in sensors.items():
+        if sensor.kind != mujoco.mjtSensor.mjSENS_VELOCIMETER or abs(sensor.y) < _TOLERANCE:
+            continue
+        gyro = next(
+            (
+                other
+                for other, body in turning.items()
+                if body == sensor.body
+                and _factor(terms[other]) != 0.0
+                and _same_instant(terms[name], terms[other])
+            ),
+            None,
+        )
+        if gyro is not None:
+            factor = 2.0 * sensor.y * _factor(terms[name]) / _factor(terms[gyro])
+            x, _, z = range(starts[name], starts[name] + 3)
+            turn_x, _, turn_z = range(starts[gyro], starts[gyro] + 3)
+            couplings += [Coupling(x, turn_z, factor), Coupling(z, turn_x, -factor)]
+        elif abs(sensor.y) > PLACE_TOLERANCE:
+            raise ValueError(
+                f"The observation {group}/{name} is the velocity of a point {sensor.y:.3g} m to the "
+                "left of the middle. Its mirror image depends on the angular velocity of "
+                f"{env.sim.mj_model.body(sensor.body).name!r}; observe that in group {group!r} too, "
+                f"without delay or with the same fixed one, or use base_lin_vel. {WITHOUT}"
+            )
+    return couplings
+
+
+def _factor(cfg: Any) -> float:
+    """Return the scale of a term, which is one number."""
+    return 1.0 if cfg.scale is None else float(cfg.scale)
+
+
+def _same_instant(one: Any, other: Any) -> bool:
+    """Return whether two terms always show values of the same time."""
+    lags = {one.delay_min_lag, one.delay_max_lag, other.delay_min_lag, other.delay_max_lag}
+    return len(lags) == 1
 
 
 def _of_command(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
@@ -228,7 +341,15 @@ def _of_rays(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
     frames = cfg.frame if isinstance(cfg.frame, tuple) else (cfg.frame,)
     rays = torch.cat(cfg.pattern.generate_rays(env.sim.mj_model, "cpu"), dim=1)
     apart = ((rays * torch.tensor(2 * DIRECTION))[:, None] - rays[None]).norm(dim=-1)
-    is_central = len(frames) == 1 and other_side(frames[0].name) == frames[0].name
+    data, root = _reference_pose(env)
+    frame = frames[0]
+    element = getattr(env.sim.mj_model, frame.type)(frame.prefixed_name())
+    points = {"body": data.xpos, "site": data.site_xpos, "geom": data.geom_xpos}[frame.type]
+    is_central = (
+        len(frames) == 1
+        and other_side(frame.name) == frame.name
+        and abs(_to_left(data, root, points[element.id])) <= PLACE_TOLERANCE
+    )
     if not is_central or (apart.min(dim=1).values > _TOLERANCE).any():
         raise ValueError(
             f"The rays of sensor {params['sensor_name']!r} are not the same on both sides, so that "
