@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 
+from mjlab.utils.processes import available_cores
+
 RESULTS = Path(__file__).parent / "results"
 
 
@@ -49,7 +51,7 @@ def write(rows: list[Row]) -> None:
 
     machine = {
         "date": datetime.now().strftime("%Y-%m-%d %H:%M"),
-        "cores": os.cpu_count(),
+        "cores": available_cores(),
         "processor": _processor(),
         "python": platform.python_version(),
         "torch": torch.__version__,

@@ -136,7 +136,7 @@ def _probe(folder: Path, rank: int) -> None:
             "saved": saved,
             "iterations": self.current_learning_iteration,
             "total_steps": self.logger.tot_timesteps,
-            "threads": self.env.cfg.sim.num_threads,
+            "threads": self.env.unwrapped.sim.capabilities.num_threads,
         }
         torch.save(held, folder / f"probe_{rank}.pt")
 

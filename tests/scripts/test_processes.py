@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -17,7 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from mjlab.rl.checkpoint import load_checkpoint
 from mjlab.scripts.run_folder import checkpoints_in, read_run_info
 from mjlab.scripts.train_run import _build_env, parse_train_flags
-from mjlab.utils.processes import ProcessRank
+from mjlab.utils.processes import ProcessRank, available_cores
 from mjlab.utils.random import process_seed
 
 
@@ -92,8 +91,8 @@ def test_steps_are_counted_over_both(pair):
 
 def test_the_cores_are_shared_out(pair):
     run, _ = pair
-    cores = len(os.sched_getaffinity(0))
-    assert run.probe(0)["threads"] == run.probe(1)["threads"] == max(1, cores // 2)
+    share = max(1, available_cores() // 2)
+    assert run.probe(0)["threads"] == run.probe(1)["threads"] == share
 
 
 def test_both_resume_from_the_checkpoint_that_the_first_finds_before_there_is_a_new_folder(pair):

@@ -326,6 +326,14 @@ def test_results_do_not_depend_on_the_number_of_threads():
     assert torch.equal(*results)
 
 
+def test_threads_of_the_physics_are_the_cores_of_this_process(monkeypatch):
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: set(range(6)), raising=False)
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert make_sim(num_envs=8).capabilities.num_threads == 3
+    assert make_sim(num_envs=2).capabilities.num_threads == 2
+    assert make_sim(num_envs=8, num_threads=1).capabilities.num_threads == 1
+
+
 def test_nan_stays_in_its_environment_and_is_not_repaired_silently():
     sim = make_sim()
     sim.data.qvel[1, 0] = float("nan")

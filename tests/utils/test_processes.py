@@ -6,7 +6,8 @@ import os
 
 import pytest
 
-from mjlab.utils.processes import ProcessRank, cores_per_process, process_rank
+from mjlab.utils import processes
+from mjlab.utils.processes import ProcessRank, available_cores, cores_per_process, process_rank
 
 VARIABLES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
 
@@ -67,3 +68,68 @@ def test_processes_share_the_cores_of_their_machine(launched, monkeypatch, proce
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(6)), raising=False)
     launched(0, processes, 0, processes)
     assert cores_per_process() == cores
+
+
+@pytest.fixture
+def cgroups(tmp_path, monkeypatch):
+    """Return a function that puts this process, which may use 16 cores, into control groups."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(16)), raising=False)
+    monkeypatch.setattr(processes, "_OWN_CGROUPS", tmp_path / "own")
+    monkeypatch.setattr(processes, "_CGROUP_ROOT", tmp_path / "fs")
+
+    def join(groups, files):
+        (tmp_path / "own").write_text(groups)
+        for name, text in files.items():
+            file = tmp_path / "fs" / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(text)
+
+    return join
+
+
+CPU, UNLIMITED = {"cpu/cpu.cfs_period_us": "100000\n"}, {"cpu/cpu.cfs_quota_us": "-1\n"}
+
+
+@pytest.mark.parametrize(
+    ("groups", "files", "cores"),
+    [
+        ("0::/\n", {"cpu.max": "200000 100000\n"}, 2),
+        ("0::/\n", {"cpu.max": "250000 100000\n"}, 3),
+        ("0::/\n", {"cpu.max": "20000 100000\n"}, 1),
+        ("0::/\n", {"cpu.max": "max 100000\n"}, 16),
+        ("0::/\n", {"cpu.max": "6400000 100000\n"}, 16),
+        ("0::/\n", {}, 16),
+        # The least of a group and of those above it.
+        ("0::/a/b\n", {"a/b/cpu.max": "max 100000\n", "a/cpu.max": "300000 100000\n"}, 3),
+        ("0::/a/b\n", {"a/b/cpu.max": "400000 100000\n", "cpu.max": "900000 100000\n"}, 4),
+        # A container sees its own group as the root, and may know itself by the host's path.
+        ("0::/docker/1f\n", {"cpu.max": "500000 100000\n"}, 5),
+        # Version 1, alone and with version 2 beside it.
+        ("1:cpu:/\n", {**CPU, "cpu/cpu.cfs_quota_us": "600000\n"}, 6),
+        ("1:cpu:/\n", {**CPU, **UNLIMITED}, 16),
+        (
+            "4:cpu,cpuacct:/job\n0::/\n",
+            {
+                "cpu,cpuacct/job/cpu.cfs_quota_us": "700000\n",
+                "cpu,cpuacct/job/cpu.cfs_period_us": "100000\n",
+            },
+            7,
+        ),
+        ("4:cpuset:/\n", {"cpuset/cpu.max": "100000 100000\n"}, 16),
+    ],
+)
+def test_threads_follow_the_quota_of_the_container(cgroups, groups, files, cores):
+    cgroups(groups, files)
+    assert available_cores() == cores
+
+
+def test_the_affinity_mask_and_the_ranks_limit_the_quota_further(cgroups, launched, monkeypatch):
+    cgroups("0::/\n", {"cpu.max": "600000 100000\n"})
+    launched(0, 3, 0, 3)
+    assert cores_per_process() == 2
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(4)), raising=False)
+    assert available_cores() == 4
+
+
+def test_a_system_without_control_groups_is_not_limited(cgroups):
+    assert available_cores() == 16

@@ -26,7 +26,7 @@ from mjlab.scripts.task_options import options_of, prepare_env_cfg, with_task_op
 from mjlab.scripts.train_checks import check_flags
 from mjlab.scripts.training_device import training_device
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
-from mjlab.utils.processes import ProcessRank, cores_per_process, process_rank
+from mjlab.utils.processes import ProcessRank, process_rank
 
 if TYPE_CHECKING:
     from mjlab.rl import MjlabOnPolicyRunner
@@ -195,8 +195,6 @@ def _apply_short_forms(cfg: TrainConfig, rank: ProcessRank) -> None:
         cfg.env.sim.nan_guard.enabled = True
     cfg.agent.seed = process_seed(cfg.agent.seed, rank.rank)
     cfg.env.seed = cfg.agent.seed
-    if rank.local_world_size > 1 and cfg.env.sim.num_threads == 0:
-        cfg.env.sim.num_threads = cores_per_process()
 
 
 def _build_env(cfg: TrainConfig, device: str, run_dir: Path, rank: ProcessRank) -> Any:

@@ -136,7 +136,8 @@ class SimulationCfg:
     """`native` runs MuJoCo on CPU threads, `warp` runs MuJoCo Warp on an NVIDIA GPU (or, slowly, on
     the CPU). `auto` takes native on `cpu` and warp on `cuda`."""
     num_threads: int = 0
-    """Physics threads of the native engine; 0 takes every core. Results do not depend on it."""
+    """Physics threads of the native engine; 0 takes every core that this process may use (affinity
+    mask, container quota, share among ranks). Results do not depend on it."""
 
     def apply_wp_opt(self, wp_opt: Any) -> None:
         """Write the Warp-only options onto `mujoco_warp`'s `Option`."""

@@ -6,8 +6,14 @@ there is one process.
 
 from __future__ import annotations
 
+import math
 import os
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
+
+_OWN_CGROUPS = Path("/proc/self/cgroup")
+_CGROUP_ROOT = Path("/sys/fs/cgroup")
 
 
 @dataclass(frozen=True)
@@ -70,9 +76,77 @@ def _number(variable: str, default: int) -> int:
 
 
 def cores_per_process() -> int:
-    """Return how many CPU cores each process of the run may use on this machine, at least 1."""
+    """Return the number of CPU cores for each process of the run on this machine, at least 1."""
+    return max(1, available_cores() // process_rank().local_world_size)
+
+
+def available_cores() -> int:
+    """Return the number of CPU cores this process may use: its affinity mask or quota, rounded up.
+
+    A container limited to two cores still sees all cores of its host; threads beyond the quota
+    are put to sleep in the middle of a step.
+    """
     if hasattr(os, "sched_getaffinity"):
         cores = len(os.sched_getaffinity(0))
     else:
         cores = os.cpu_count() or 1
-    return max(1, cores // process_rank().local_world_size)
+    quota = _cpu_quota()
+    return cores if quota is None else max(1, min(cores, math.ceil(quota)))
+
+
+def _cpu_quota() -> float | None:
+    """Return the CPU quota of this process's control group (cores), None if unlimited.
+
+    The limits of all groups above it apply as well.
+    """
+    quotas = [
+        quota
+        for folder, read in _control_groups()
+        for group in (folder, *folder.parents)
+        if group.is_relative_to(_CGROUP_ROOT) and (quota := read(group)) is not None
+    ]
+    return min(quotas, default=None)
+
+
+def _control_groups() -> Iterator[tuple[Path, Callable[[Path], float | None]]]:
+    """Yield the folder of each control group that may limit this process, and its reader.
+
+    A line of `/proc/self/cgroup` is `<number>:<controllers>:<path>`; version 2 has no controllers.
+    """
+    try:
+        lines = _OWN_CGROUPS.read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        group = path.lstrip("/")
+        if not controllers:
+            yield _CGROUP_ROOT / group, _quota_v2
+            yield _CGROUP_ROOT / "unified" / group, _quota_v2
+        elif "cpu" in controllers.split(","):
+            yield _CGROUP_ROOT / controllers / group, _quota_v1
+            yield _CGROUP_ROOT / "cpu" / group, _quota_v1
+
+
+def _quota_v2(group: Path) -> float | None:
+    # "<quota> <period>" in microseconds; the quota is "max" if there is no limit.
+    return _ratio(*_words(group / "cpu.max"))
+
+
+def _quota_v1(group: Path) -> float | None:
+    # The quota is -1 if there is no limit.
+    names = ("cpu.cfs_quota_us", "cpu.cfs_period_us")
+    return _ratio(*(word for name in names for word in _words(group / name)))
+
+
+def _words(file: Path) -> list[str]:
+    try:
+        return file.read_text().split()
+    except OSError:
+        return []
+
+
+def _ratio(*words: str) -> float | None:
+    if len(words) != 2 or not all(word.isdigit() and int(word) > 0 for word in words):
+        return None
+    return int(words[0]) / int(words[1])

@@ -32,6 +32,7 @@ from mjlab.sim.engines.native_midphase import MidphaseMargins
 from mjlab.sim.engines.native_rays import NativeRays
 from mjlab.sim.engines.native_render import NativeRenderer, render_problem
 from mjlab.sim.engines.sensor_fed import refuse_without_sensor
+from mjlab.utils.processes import cores_per_process
 
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
@@ -85,8 +86,10 @@ class NativeEngine(Engine):
         # MuJoCo would put a diverged environment back to qpos0 by itself and hide the NaN from
         # the guard and from the environment, which count it and reset that environment.
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        # `mjbatch` would take every core of the machine by itself.
+        threads = cfg.num_threads or min(cores_per_process(), num_envs)
         try:
-            self._batch = mjbatch.Batch(self._model, num_envs, cfg.num_threads)
+            self._batch = mjbatch.Batch(self._model, num_envs, threads)
         except (ValueError, RuntimeError) as error:
             raise EngineUnavailableError(
                 f"The native engine refuses this model: {error}. Use --engine warp."
