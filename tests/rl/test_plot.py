@@ -38,7 +38,9 @@ def test_mean_and_deviation_are_over_all_runs_at_every_iteration():
     iterations, mean, std = mean_and_std([one, other])
     assert iterations.tolist() == [0, 1, 2, 4]
     assert mean.tolist() == [0.0, 2.0, 3.0, 4.0]
-    assert std.tolist() == [0.0, 1.0, 1.0, 0.0]
+    # Of two values, the sample standard deviation is their distance over the root of two.
+    assert std == pytest.approx(np.array([0.0, 2.0, 2.0, 0.0]) / np.sqrt(2))
+    assert mean_and_std([one])[2].tolist() == [0.0, 0.0, 0.0]
 
 
 def test_one_run_and_several_seeds_become_pngs(tmp_path: Path):

@@ -91,7 +91,7 @@ def plot_seeds(
     tag: str = DEFAULT_TAG,
     title: str | None = None,
 ) -> Path:
-    """Draw the mean over runs that differ in their seed, with one standard deviation shaded.
+    """Draw the mean over runs that differ in their seed, with one sample standard deviation shaded.
 
     A run that stopped early keeps its last value, because a task that is solved stays solved: so
     the mean is over all runs at every iteration.
@@ -127,19 +127,20 @@ def plot_seeds(
             axes.legend()
 
     output = Path(output)
-    default = f"Mean over {seeds} seeds (shaded: one standard deviation)"
+    default = f"Mean over {seeds} seeds (shaded: one sample standard deviation)"
     _draw_figure(draw, output, tag, default if title is None else title)
     return output
 
 
 def mean_and_std(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return iterations, mean and standard deviation over `curves`, at every iteration any has.
+    """Return iterations, mean and sample standard deviation over `curves`, at every iteration any has.
 
-    Between its points a curve is linear; before its first and after its last it is constant.
+    The deviation divides by n - 1, as that of few seeds must; one curve has none (0). Between its points a curve is linear; before its first and after its last it is constant.
     """
     iterations = np.unique(np.concatenate([curve[0] for curve in curves]))
     values = np.stack([np.interp(iterations, *curve) for curve in curves])
-    return iterations, values.mean(axis=0), values.std(axis=0)
+    std = values.std(axis=0, ddof=1) if len(values) > 1 else np.zeros(len(iterations))
+    return iterations, values.mean(axis=0), std
 
 
 def _draw_figure(draw, output: Path, tag: str, title: str) -> None:

@@ -11,7 +11,7 @@ from mjlab.scripts.cli import UserError, run_command
 def _command(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(
         prog="plot-seeds",
-        description="Draw the mean over runs, with one standard deviation shaded.",
+        description="Draw the mean over runs, with one sample standard deviation shaded.",
     )
     parser.add_argument("runs", nargs="+", type=Path, help="folders of the runs")
     parser.add_argument("--output", type=Path, default=Path("seeds.png"), help="PNG to write")
