@@ -102,7 +102,8 @@ def test_both_resume_from_the_checkpoint_that_the_first_finds_before_there_is_a_
     early = before.with_name("9999-01-01_00-00-00")
     early.mkdir()
     flags = ("--agent.resume", "True", "--agent.max-iterations", "3", "--torchrunx-log-dir", "")
-    resumed = ProcessRun(run.folder, *flags, patches=("count_lookups",))
+    drawn = ("--agent.seed", "-1")
+    resumed = ProcessRun(run.folder, *flags, *drawn, patches=("count_lookups",))
     ended = resumed.end()
     early.rmdir()
     assert [process.status for process in ended] == [0, 0], ended
@@ -113,6 +114,10 @@ def test_both_resume_from_the_checkpoint_that_the_first_finds_before_there_is_a_
     (run_dir,) = set(resumed.runs()) - {before}
     assert [path.name for path in checkpoints_in(run_dir)] == ["model_2.pt"]
     assert not (run_dir / "torchrunx").exists()
+    # The first process draws the seed of all.
+    seed = resumed.probe(0)["seed"]
+    assert f"--agent.seed {seed} repeats the run" in ended[0].out
+    assert resumed.probe(1)["seed"] == process_seed(seed, 1)
     assert resumed.probe(1)["iterations"] == 3
     assert resumed.probe(0)["total_steps"] == 3 * 4 * 4 * 2
     assert_same_weights(resumed)

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from commands import SMALL
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from mjlab.rl.checkpoint import load_checkpoint
@@ -85,6 +86,19 @@ def test_the_short_forms_win_over_the_task(train, tmp_path):
     assert env["sim"]["engine"] == "native"
     assert env["sim"]["mujoco"]["timestep"] == 0.02
     assert env["seed"] == 7
+
+
+def test_a_drawn_seed_is_said_and_repeats_the_run(run, train, tmp_path):
+    argv = [TASK, *SMALL, "--log-root", str(tmp_path), "--agent.max-iterations", "1"]
+    outcome = run("train", *argv, "--agent.seed", "-1")
+    (drawn,) = (tmp_path / "cartpole").iterdir()
+    agent, env = (
+        yaml.safe_load((drawn / "params" / f"{name}.yaml").read_text()) for name in ("agent", "env")
+    )
+    assert agent["seed"] == env["seed"] >= 0
+    assert f"--agent.seed {agent['seed']} repeats the run" in outcome.out
+    again = train(tmp_path, 1, "--agent.seed", str(agent["seed"]))
+    assert_same_weights(drawn / "model_0.pt", again / "model_0.pt")
 
 
 def test_a_run_leaves_all_its_files(trained):

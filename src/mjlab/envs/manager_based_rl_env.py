@@ -36,7 +36,7 @@ from mjlab.scene import Scene
 from mjlab.sim.engine import resolve_engine_name
 from mjlab.sim.simulation import Simulation
 from mjlab.utils import spaces
-from mjlab.utils.random import seed_rng
+from mjlab.utils.random import draw_seed, seed_rng
 
 if TYPE_CHECKING:
     from mjlab.viewer.debug_visualizer import DebugVisualizer
@@ -425,7 +425,7 @@ class ManagerBasedRlEnv:
     def seed(seed: int = -1) -> int:
         """Seed every random number generator; -1 draws a seed. Returns the seed used."""
         if seed == -1:
-            seed = int(np.random.default_rng().integers(0, 10_000))
+            seed = draw_seed()
         seed_rng(seed)
         return seed
 

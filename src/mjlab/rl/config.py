@@ -137,7 +137,8 @@ class RslRlBaseRunnerCfg:
     """A training run."""
 
     seed: int = 42
-    """Seed of the run, of the environment too. Further processes of the run derive theirs from it."""
+    """Seed of the run, of the environment too; -1 draws one, which is printed and recorded. Further
+    processes of the run derive theirs from it."""
     num_steps_per_env: int = 24
     """Environment steps per iteration."""
     max_iterations: int = 300

@@ -128,7 +128,11 @@ def _train(
     task: str, cfg: TrainConfig, device: str, rank: ProcessRank, output: ProcessOutput | None
 ) -> Path:
     from mjlab.rl.distributed import from_first, same_fate
+    from mjlab.utils.random import draw_seed
 
+    if cfg.agent.seed == -1:
+        cfg.agent.seed = from_first(draw_seed)
+        print(f"Seed:    {cfg.agent.seed}, drawn; --agent.seed {cfg.agent.seed} repeats the run")
     _apply_short_forms(cfg, rank)
     # The checkpoint is looked for before there is a new folder to be found, and by one process.
     checkpoint = from_first(lambda: checkpoint_to_resume(task, cfg))

@@ -21,6 +21,11 @@ _EVALUATIONS, _SESSIONS = 2**31, 2**31 + 2**30
 _SPREAD = 0x9E3779B1
 
 
+def draw_seed() -> int:
+    """Return a seed from 0 to 9999 drawn from the system's entropy, whatever was seeded before."""
+    return int(np.random.default_rng().integers(0, 10_000))
+
+
 def seed_rng(seed: int, torch_deterministic: bool = False) -> None:
     """Seed the generators of Python, NumPy and torch (CPU and GPUs).
 
