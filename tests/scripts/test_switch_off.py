@@ -76,6 +76,7 @@ def test_every_kind_of_term_can_be_switched_off(config, path, term):
         ["--env.rewards.smooth-reward.weight", "None"],
         ["--env.scene.entities.cartpole", "None"],
         ["--env.seed", "None"],
+        ["--env.observations.actor.terms.pole-vel.func", "None"],
         ["--nothing.at.all", "None"],
         ["--agent.algorithm", "None"],
         ["env.rewards.smooth-reward", "None"],

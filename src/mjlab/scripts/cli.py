@@ -166,11 +166,13 @@ def task_and_flags(argv: list[str], usage: str) -> tuple[str, list[str]]:
 def parse_flags(config_type: type[C], default: C, flags: list[str], prog: str) -> C:
     """Return `default` with the fields replaced that `flags` name; exits on an unknown flag.
 
-    `--env.rewards.<term> None`, and the like for every other kind of term, switches the term off.
+    `--env.rewards.<term> None`, and the like for every other kind of term, switches the term off;
+    `None` also removes a config inside another where the field may be None, such as a term's noise.
     """
     import tyro
 
     import mjlab
+    from mjlab.scripts.flag_values import flag_rules
     from mjlab.scripts.switch_off import switch_terms_off
 
     edited, flags = switch_terms_off(default, flags)
@@ -180,6 +182,7 @@ def parse_flags(config_type: type[C], default: C, flags: list[str], prog: str) -
         args=_with_explicit_switches(config_type, flags),
         prog=prog,
         config=mjlab.TYRO_FLAGS,
+        registry=flag_rules(),
     )
 
 

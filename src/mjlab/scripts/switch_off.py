@@ -1,7 +1,8 @@
-"""Switching terms off from the command line: `--env.rewards.smooth-reward None`.
+"""Switching terms and optional configs off from the command line:
+`--env.rewards.smooth-reward None`, `--env.observations.actor.terms.joint-vel.noise None`.
 
-A term that is None is off. tyro has no flag for a whole config inside a dict, only for its fields,
-so these flags are taken out of the command line before tyro reads it.
+A term or config that is None is off. tyro has no flag for a whole config inside another one, only
+for its fields, so these flags are taken out of the command line before tyro reads it.
 """
 
 from __future__ import annotations
@@ -9,7 +10,8 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Mapping
 from dataclasses import is_dataclass
-from typing import Any, TypeVar
+from types import NoneType
+from typing import Any, TypeVar, get_args, get_type_hints
 
 C = TypeVar("C")
 
@@ -28,14 +30,12 @@ _TERM_DICTS = frozenset(
         "recorders",
     )
 )
-# Further configs that are off where they are None, and have flags for what is in them.
-_OPTIONAL = frozenset(("symmetry_cfg",))
 
 
 def switch_terms_off(default: C, flags: list[str]) -> tuple[C, list[str]]:
-    """Return `default` without the terms that `flags` set to None, and the remaining flags.
+    """Return `default` without the terms and configs `flags` set to None, and the remaining flags.
 
-    Flags that name no term of `default` remain, for tyro to judge. `default` itself stays as it is.
+    All other flags remain, for tyro to judge. `default` itself is not modified.
     """
     config = copy.deepcopy(default)
     remaining: list[str] = []
@@ -77,16 +77,26 @@ def _term_at(config: Any, flag: str) -> tuple[Any, str]:
     value, key, inside = config, "", ""
     for part in flag.removeprefix("--").split("."):
         inside, holder = key, value
+        if holder is None:
+            return None, ""
         names = list(holder) if isinstance(holder, Mapping) else list(vars(holder))
         matching = [name for name in names if _spelled_alike(name, part)]
         if not matching:
             return None, ""
         key = matching[0]
         value = holder[key] if isinstance(holder, Mapping) else getattr(holder, key)
-        if not is_dataclass(value) and not isinstance(value, Mapping):
+        if not is_dataclass(value) and not isinstance(value, Mapping | None):
             return None, ""
     is_term = isinstance(holder, dict) and inside in _TERM_DICTS
-    return (holder, key) if is_term or key in _OPTIONAL else (None, "")
+    return (holder, key) if is_term or _may_be_none(holder, key) else (None, "")
+
+
+def _may_be_none(holder: Any, key: str) -> bool:
+    """Return True if field `key` of a config is declared as another config or None."""
+    if not is_dataclass(holder):
+        return False
+    options = get_args(get_type_hints(type(holder)).get(key))
+    return NoneType in options and any(is_dataclass(option) for option in options)
 
 
 def _spelled_alike(name: Any, part: str) -> bool:
