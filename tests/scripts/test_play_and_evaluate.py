@@ -125,10 +125,18 @@ def test_evaluation_prints_figures_for_machines_and_nothing_else(run, trained):
     assert figures["success_rate"] == 0.0
 
 
+@pytest.mark.parametrize(("flags", "num_envs"), [((), 4), (("--env.scene.num-envs", "3"), 3)])
+def test_episodes_are_played_in_as_many_environments_as_asked_for(run, flags, num_envs):
+    outcome = run("evaluate", TASK, *SHORT, "--agent", "zero", "--json", *flags)
+    assert outcome.status == 0, outcome.err
+    figures = json.loads(outcome.out)
+    assert (figures["num_envs"], figures["num_episodes"]) == (num_envs, 4)
+
+
 def test_evaluation_prints_a_table_for_people(run, trained):
     outcome = run("evaluate", TASK, *SHORT, "--log-root", str(trained.parents[1]))
     assert outcome.status == 0, outcome.err
-    for part in ("Mean return", "95 % interval", "Success      0.0%", "at least 900", "native",
+    for part in ("4 in 4 environments", "Mean return", "95 % interval", "Success      0.0%", "at least 900", "native",
                  "Note         4 of 4 episodes were cut off", "rare failures"):  # fmt: skip
         assert part in outcome.out
 

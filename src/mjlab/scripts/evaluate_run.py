@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.scripts.cli import UserError, resolve_device
 from mjlab.scripts.policy import (
     PolicyFlags,
@@ -14,6 +15,7 @@ from mjlab.scripts.policy import (
     find_checkpoint,
     make_env,
     make_policy,
+    policy_env_cfg,
 )
 from mjlab.tasks.registry import load_rl_cfg
 
@@ -23,7 +25,7 @@ class EvaluateConfig(PolicyFlags):
     """Flags of `evaluate`."""
 
     num_episodes: int = 256
-    """Episodes to play, one in each environment."""
+    """Episodes to play, one per environment; in rounds if --env.scene.num-envs is set lower."""
     max_steps: int | None = None
     """Steps after which an episode is cut off, and is no success; None is the episode length of
     evaluations."""
@@ -52,7 +54,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
         task,
         env_cfg,
         device,
-        cfg.num_episodes,
+        _num_envs(task, cfg, env_cfg),
         cfg.engine,
         seed=cfg.seed,
         profile=cfg.profile,
@@ -71,6 +73,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
             seed=cfg.seed,
         )
         physics = env.unwrapped.sim.capabilities.description
+        num_envs = env.num_envs
     finally:
         env.close()
     figures = {
@@ -78,6 +81,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
         "policy": cfg.agent if checkpoint is None else str(checkpoint),
         "physics": physics,
         "seed": cfg.seed,
+        "num_envs": num_envs,
         "success_definition": success_definition(solved),
         **result.to_dict(),
     }
@@ -85,12 +89,20 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
     return figures
 
 
+def _num_envs(task: str, cfg: EvaluateConfig, env_cfg: ManagerBasedRlEnvCfg) -> int:
+    """Return the number of environments: the one set by --env.scene.num-envs, else one per episode."""
+    usual = policy_env_cfg(task, cfg.profile, purpose="evaluate").scene.num_envs
+    chosen = env_cfg.scene.num_envs
+    return cfg.num_episodes if chosen == usual else chosen
+
+
 def _table(figures: dict[str, Any]) -> str:
     lines = [
         f"Task         {figures['task']}",
         f"Policy       {figures['policy']}",
         f"Physics      {figures['physics']}",
-        f"Episodes     {figures['num_episodes']}, mean length {figures['mean_length']:.1f} steps",
+        f"Episodes     {figures['num_episodes']} in {figures['num_envs']} environments, "
+        f"mean length {figures['mean_length']:.1f} steps",
         f"Mean return  {figures['mean_return']:.2f}   {_interval(figures['return_interval'], '.2f')}"
         f"   range [{figures['min_return']:.2f}, {figures['max_return']:.2f}]",
         "             (sum over the episode of the weighted reward before scaling by the time step)",
