@@ -6,6 +6,7 @@ import importlib
 import logging
 import sys
 import textwrap
+import tomllib
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -120,6 +121,40 @@ def test_a_broken_package_is_reported_with_its_traceback_and_skipped(
     (record,) = caplog.records
     for part in ("'first'", value, told, "Traceback"):
         assert part in record.getMessage()
+    assert "mjlab[compat]" not in record.getMessage()
+
+
+def _extra(name: str) -> list[str]:
+    pyproject = Path(__file__).parents[2] / "pyproject.toml"
+    return tomllib.loads(pyproject.read_text())["project"]["optional-dependencies"][name]
+
+
+@pytest.mark.parametrize("module", _extra("compat"))
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import {module}",
+        "from {module}.sub import thing",
+        "try:\n    import {module}\nexcept ImportError as e:\n    raise RuntimeError('no') from e",
+    ],
+)
+def test_a_package_that_misses_a_module_of_the_extra_is_told_the_extra(
+    install, caplog, monkeypatch, module, text
+):
+    # An entry of None makes the import fail, also where the extra is installed.
+    monkeypatch.setitem(sys.modules, module, None)
+    install("their-package", {"first": "broken"}, {"broken.py": text.format(module=module)})
+    registry.list_tasks()
+    (record,) = caplog.records
+    assert f"{module} comes with the extra mjlab[compat]" in record.getMessage()
+
+
+def test_a_task_whose_config_misses_such_a_module_is_told_the_extra_too(install, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mediapy", None)
+    install("their-package", {}, {"their_configs.py": "import mediapy"})
+    registry.register_mjlab_task("Their-Task", "their_configs:make", rl_cfg="their_configs:make")
+    with pytest.raises(registry.TaskImportError, match=r"mjlab\[compat\]"):
+        registry.load_env_cfg("Their-Task")
 
 
 def test_a_package_that_fails_half_way_leaves_none_of_its_tasks(install, caplog):

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 ENTRY_POINT_GROUP = "mjlab.tasks"
+# Modules that every 1.x release brought along, and that are an extra here.
+_COMPAT_MODULES = frozenset({"torchrunx", "mediapy", "moviepy"})
 
 
 class UnknownTaskError(KeyError):
@@ -234,7 +236,7 @@ def _imported(task_name: str, name: str) -> Any:
     except (Exception, SystemExit) as error:
         raise TaskImportError(
             f"Task {task_name!r} cannot be used, because importing {name!r}, which it was "
-            f"registered with, failed: {type(error).__name__}: {error}"
+            f"registered with, failed: {type(error).__name__}: {error}{_missing_extra(error)}"
         ) from error
 
 
@@ -261,12 +263,28 @@ def _register_all(source: str, load: Callable[[], object]) -> None:
     try:
         load()
     # A broken package must not take the others down with it, not even one that exits.
-    except (Exception, SystemExit):
+    except (Exception, SystemExit) as error:
         # What it registered before it failed may need what it would have done after.
         _tasks.clear()
         _tasks.update(before)
         logger.error(
-            "Tasks of %s are skipped, because it fails to import:\n%s",
+            "Tasks of %s are skipped, because it fails to import:\n%s%s",
             source,
             traceback.format_exc().rstrip(),
+            _missing_extra(error),
         )
+
+
+def _missing_extra(error: BaseException) -> str:
+    """Return the sentence that names the extra, if `error` comes from one of its modules missing."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, ModuleNotFoundError) and cause.name is not None:
+            module = cause.name.partition(".")[0]
+            if module in _COMPAT_MODULES:
+                return (
+                    f"\n{module} comes with the extra mjlab[compat]: require that in place of "
+                    "mjlab, or run `uv sync --extra compat` in the checkout."
+                )
+        cause = cause.__cause__ or cause.__context__
+    return ""
