@@ -1,0 +1,235 @@
+"""The wheel: its version satisfies task packages, and it carries types. Everything offline."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import re
+import shutil
+import subprocess
+import sys
+import textwrap
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+_UV = (
+    os.environ.get("UV")
+    or shutil.which("uv")
+    or shutil.which("uv", path=Path.home() / ".local" / "bin")
+)
+needs_uv = pytest.mark.skipif(_UV is None, reason="uv, which resolves, is not installed")
+
+
+def run(*command: str | Path, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command,
+        cwd=cwd,
+        env={**os.environ, **variables},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def build_wheel(project: Path, folder: Path) -> Path:
+    before = set(folder.glob("*.whl"))
+    hatch = (sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder))
+    built = run(*hatch, cwd=project)
+    assert built.returncode == 0, built.stderr
+    (wheel,) = set(folder.glob("*.whl")) - before
+    return wheel
+
+
+def build_package(project: Path, folder: Path, requirement: str) -> Path:
+    """Build a package with one task, which requires `requirement`."""
+    (project / "walker_tasks").mkdir(parents=True)
+    (project / "pyproject.toml").write_text(
+        textwrap.dedent(
+            f"""
+            [build-system]
+            requires = ["hatchling"]
+            build-backend = "hatchling.build"
+
+            [project]
+            name = "walker-tasks"
+            version = "0.3"
+            dependencies = ["{requirement}"]
+
+            [project.entry-points."mjlab.tasks"]
+            walker = "walker_tasks"
+            """
+        )
+    )
+    (project / "walker_tasks" / "__init__.py").write_text(
+        textwrap.dedent(
+            """
+            from prettytable import PrettyTable
+
+            from mjlab.tasks.registry import register_mjlab_task
+
+            register_mjlab_task("Walker", "walker_tasks.cfg:env", rl_cfg="walker_tasks.cfg:rl")
+            """
+        )
+    )
+    return build_wheel(project, folder)
+
+
+def stand_in(name: str, folder: Path) -> None:
+    """Write a wheel without files under the name and version of a distribution installed here."""
+    version = importlib.metadata.version(name)
+    stem = f"{name.replace('-', '_')}-{version}"
+    metadata = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
+    tag = "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
+    with zipfile.ZipFile(folder / f"{stem}-py3-none-any.whl", "w") as wheel:
+        wheel.writestr(f"{stem}.dist-info/METADATA", metadata)
+        wheel.writestr(f"{stem}.dist-info/WHEEL", tag)
+        wheel.writestr(f"{stem}.dist-info/RECORD", "")
+
+
+@pytest.fixture(scope="module")
+def wheels(tmp_path_factory) -> Path:
+    """Return a folder with the wheel of this checkout, and stand-ins for its dependencies."""
+    folder = tmp_path_factory.mktemp("wheels")
+    wheel = build_wheel(ROOT, folder)
+    with zipfile.ZipFile(wheel) as files:
+        (metadata,) = (name for name in files.namelist() if name.endswith("/METADATA"))
+        text = files.read(metadata).decode()
+    for requirement in re.findall(r"^Requires-Dist: (.*)$", text, re.MULTILINE):
+        if "extra ==" not in requirement:
+            stand_in(re.split(r"[^\w-]", requirement)[0], folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def site(wheels, tmp_path_factory) -> Path:
+    """Return a folder with this checkout's wheel unpacked as an installer would."""
+    folder = tmp_path_factory.mktemp("site")
+    (wheel,) = wheels.glob("mjlab-*.whl")
+    with zipfile.ZipFile(wheel) as files:
+        files.extractall(folder)
+    return folder
+
+
+def install(wheels: Path, target: Path, *flags: str) -> subprocess.CompletedProcess[str]:
+    assert _UV is not None
+    return run(
+        _UV, "pip", "install", "--python", sys.executable, "--offline", "--no-index", "--no-config",
+        "--find-links", wheels, "--target", target, *flags, "walker-tasks", cwd=target.parent,
+    )  # fmt: skip
+
+
+def test_the_version_says_which_interface_it_speaks():
+    assert re.fullmatch(r"1\.6\.1\d\d", VERSION)
+
+
+@needs_uv
+def test_a_package_of_the_releases_resolves_and_its_task_is_found(wheels, tmp_path):
+    folder = shutil.copytree(wheels, tmp_path / "wheels")
+    build_package(tmp_path / "package", folder, "mjlab>=1.4,<2")
+    done = install(folder, tmp_path / "site")
+    assert done.returncode == 0, done.stderr
+    installed = {path.name for path in (tmp_path / "site").glob("*.dist-info")}
+    assert {f"mjlab-{VERSION}.dist-info", "walker_tasks-0.3.dist-info"} <= installed
+    listed = run(
+        sys.executable, "-c",
+        "import mjlab; from mjlab.tasks.registry import list_tasks; "
+        "print(mjlab.__file__, 'Walker' in list_tasks())",
+        cwd=tmp_path, PYTHONPATH=str(tmp_path / "site"),
+    )  # fmt: skip
+    assert listed.stdout.split() == [str(tmp_path / "site" / "mjlab" / "__init__.py"), "True"], (
+        listed.stderr
+    )
+
+
+@needs_uv
+def test_a_package_pinned_below_is_refused_unless_the_pin_is_overridden(wheels, tmp_path):
+    folder = shutil.copytree(wheels, tmp_path / "wheels")
+    build_package(tmp_path / "package", folder, "mjlab==1.2.0")
+    refused = install(folder, tmp_path / "site")
+    assert refused.returncode != 0
+    assert "mjlab==1.2.0" in refused.stderr
+    (tmp_path / "overrides.txt").write_text("mjlab\n")
+    done = install(folder, tmp_path / "site", "--overrides", "overrides.txt")
+    assert done.returncode == 0, done.stderr
+
+
+@needs_uv
+def test_a_project_takes_this_mjlab_for_all_its_packages(wheels, tmp_path):
+    """As docs/other_packages.md says: a source, and an override for pins below 1.6."""
+    folder = shutil.copytree(wheels, tmp_path / "wheels")
+    build_package(tmp_path / "package", folder, "mjlab==1.2.0")
+    (wheel,) = folder.glob("mjlab-*.whl")
+    # Out of the index, so that only the source can bring it.
+    wheel.rename(tmp_path / wheel.name)
+    project = tmp_path / "project"
+    project.mkdir()
+    (project / "pyproject.toml").write_text(
+        textwrap.dedent(
+            f"""
+            [project]
+            name = "mine"
+            version = "0"
+            requires-python = "=={sys.version_info.major}.{sys.version_info.minor}.*"
+            dependencies = ["mjlab", "walker-tasks"]
+
+            [tool.uv]
+            no-index = true
+            find-links = ["../wheels"]
+            override-dependencies = ["mjlab"]
+
+            [tool.uv.sources]
+            mjlab = {{ path = "../{wheel.name}" }}
+            """
+        )
+    )
+    assert _UV is not None
+    locked = run(_UV, "lock", "--offline", "--python", sys.executable, cwd=project)
+    assert locked.returncode == 0, locked.stderr
+    text = (project / "uv.lock").read_text()
+    assert f'source = {{ path = "../{wheel.name}" }}' in text
+    assert f'version = "{VERSION}"' in text
+
+
+def test_the_wheel_carries_its_types(site):
+    assert (site / "mjlab" / "py.typed").is_file()
+
+
+def test_a_package_is_type_checked_against_the_wheel(site, tmp_path):
+    right = textwrap.dedent(
+        """
+        from typing import assert_type
+
+        import torch
+
+        from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
+        from mjlab.managers import RewardTermCfg
+        from mjlab.tasks.registry import load_env_cfg
+
+
+        def height(env: ManagerBasedRlEnv) -> torch.Tensor:
+            return env.sim.data.qpos[:, 2]
+
+
+        cfg = load_env_cfg("Mjlab-Cartpole-Balance")
+        assert_type(cfg, ManagerBasedRlEnvCfg)
+        assert_type(cfg.decimation, int)
+        cfg.rewards["height"] = RewardTermCfg(func=height, weight=1.0)
+        """
+    )
+    (tmp_path / "right.py").write_text(right)
+    (tmp_path / "wrong.py").write_text(right.replace("weight=1.0", "weight='much'"))
+
+    def check(file: str) -> subprocess.CompletedProcess[str]:
+        ty = Path(sys.executable).with_name("ty")
+        search = ("--python", sys.prefix, "--extra-search-path", str(site))
+        return run(ty, "check", *search, "--output-format", "concise", file, cwd=tmp_path)
+
+    passed, failed = check("right.py"), check("wrong.py")
+    assert passed.returncode == 0, passed.stdout
+    assert "Expected `float`" in failed.stdout
+    assert "Found 1 diagnostic" in failed.stdout
