@@ -27,12 +27,14 @@ def make_runner(tmp_path: Path) -> Callable[..., Any]:
     from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
 
     def make(
-        log_dir: Path | None = None, num_envs: int = 8, env_cfg: dict | None = None, **changes: Any
+        log_dir: Path | None = None,
+        num_envs: int = 8,
+        env_cfg: dict | None = None,
+        runner_cls: type[MjlabOnPolicyRunner] = MjlabOnPolicyRunner,
+        **changes: Any,
     ) -> Any:
         cfg = FakeEnvCfg(scene=FakeSceneCfg(num_envs=num_envs), **(env_cfg or {}))
         env = RslRlVecEnvWrapper(FakeEnv(cfg))
-        return MjlabOnPolicyRunner(
-            env, runner_cfg(**changes), None if log_dir is None else str(log_dir)
-        )
+        return runner_cls(env, runner_cfg(**changes), None if log_dir is None else str(log_dir))
 
     return make

@@ -19,12 +19,17 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+# What the config may also call a service, as rsl_rl's classes.
+_LOGGER_TYPES = {"WandbLogWriter": "wandb", "NeptuneLogWriter": "neptune"}
+
 
 class RunLogger(Logger):
     """rsl_rl's logger, silent on the console and without a GPU synchronization per step.
 
     What an iteration's steps report stays on the device until `finish_iteration` reads it all at
     once. Tags in the event files are rsl_rl's, and `Train/mean_step_reward` besides.
+
+    Runners with a loop of their own, written against rsl_rl, call `log` instead.
     """
 
     def __init__(self, *args: Any, reward_unit: float = 1.0, **kwargs: Any) -> None:
@@ -33,9 +38,35 @@ class RunLogger(Logger):
         super().__init__(*args, **kwargs)
         self._reward_unit = reward_unit
         self._session_time = 0.0
-        self._finished: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]] = []
+        # Sums over the running episodes, and those of the last finished ones.
+        self._episode_sums = [
+            (self.cur_reward_sum, self.rewbuffer),
+            (self.cur_episode_length, self.lenbuffer),
+        ]
+        if self._uses_rnd:
+            self._episode_sums += [
+                (self.cur_ereward_sum, self.erewbuffer),
+                (self.cur_ireward_sum, self.irewbuffer),
+            ]
+        self._finished: list[tuple[torch.Tensor, ...]] = []
         self._step_rewards: list[torch.Tensor] = []
         self._write_failed = False
+
+    @property
+    def logger_type(self) -> str | None:
+        """Service that figures go to, as the config names it (`tensorboard`, `wandb`, ...).
+
+        None until `init_logging_writer` has opened one, and in processes that write nothing.
+        """
+        if self.writer is None:
+            return None
+        wanted = self.cfg.get("logger", "tensorboard")
+        name = wanted if isinstance(wanted, str) else wanted["class_name"]
+        return _LOGGER_TYPES.get(name, name)
+
+    @property
+    def _uses_rnd(self) -> bool:
+        return bool(self.cfg["algorithm"].get("rnd_cfg"))
 
     def init_logging_writer(self) -> None:
         """Open the event file.
@@ -45,9 +76,10 @@ class RunLogger(Logger):
             ModuleNotFoundError: Weights & Biases is asked for and not installed.
             ValueError: Weights & Biases did not start a run: nobody is logged in, and the like.
         """
+        wanted = self.cfg.get("logger", "tensorboard")
         if self.log_dir is not None and not self.disable_logs:
             ensure_writable_folder(self.log_dir)
-            self.cfg["logger"] = self._writer_config()
+            self.cfg["logger"] = _writer_config(wanted, self.cfg)
         with contextlib.redirect_stdout(io.StringIO()) as printed:
             try:
                 super().init_logging_writer()
@@ -55,19 +87,11 @@ class RunLogger(Logger):
                 if not _is_of_wandb(error):
                     raise
                 raise ValueError(_wandb_message(error)) from error
+            finally:
+                # Runners read from their config which service there is.
+                self.cfg["logger"] = wanted
         for line in filter(None, printed.getvalue().splitlines()):
             logger.debug("%s", line)
-
-    def _writer_config(self) -> str | dict[str, Any]:
-        wanted = self.cfg.get("logger", "tensorboard")
-        if wanted == "wandb":
-            wanted = {
-                "class_name": "WandbLogWriter",
-                "project_name": self.cfg.get("wandb_project"),
-            }
-        if isinstance(wanted, dict) and wanted.get("class_name") == "WandbLogWriter":
-            enable_wandb()
-        return wanted
 
     def process_env_step(
         self,
@@ -85,10 +109,21 @@ class RunLogger(Logger):
         self.cur_reward_sum += rewards
         if intrinsic_rewards is not None:
             self.cur_reward_sum += intrinsic_rewards
+            self.cur_ereward_sum += rewards
+            self.cur_ireward_sum += intrinsic_rewards
         self.cur_episode_length += 1
-        self._finished.append((done, self.cur_reward_sum.clone(), self.cur_episode_length.clone()))
-        self.cur_reward_sum.masked_fill_(done, 0.0)
-        self.cur_episode_length.masked_fill_(done, 0.0)
+        self._finished.append((done, *(running.clone() for running, _ in self._episode_sums)))
+        for running, _ in self._episode_sums:
+            running.masked_fill_(done, 0.0)
+
+    def log(self, it: int, *args: Any, **kwargs: Any) -> None:
+        """Write and print iteration number `it` (from 0), for loops written against rsl_rl.
+
+        The arguments are those of rsl_rl's `Logger.log`.
+        """
+        self._collect_finished_episodes()
+        super().log(it, *args, **kwargs)
+        self.write_scalars({"Train/mean_step_reward": self._mean_step_reward()}, it)
 
     def finish_iteration(
         self,
@@ -133,10 +168,10 @@ class RunLogger(Logger):
     def _collect_finished_episodes(self) -> None:
         if not self._finished:
             return
-        done, sums, lengths = (torch.stack(column) for column in zip(*self._finished, strict=True))
+        done, *sums = (torch.stack(column) for column in zip(*self._finished, strict=True))
         self._finished.clear()
-        self.rewbuffer.extend(sums[done].tolist())
-        self.lenbuffer.extend(lengths[done].tolist())
+        for (_, last), of_steps in zip(self._episode_sums, sums, strict=True):
+            last.extend(of_steps[done].tolist())
 
     def _mean_step_reward(self) -> float:
         if not self._step_rewards:
@@ -169,15 +204,24 @@ class RunLogger(Logger):
             "Perf/learning_time": stats.learning_time,
             "Train/mean_step_reward": stats.mean_step_reward,
         }
+        over_time = {}
         if stats.mean_reward is not None and stats.mean_episode_length is not None:
             scalars["Train/mean_reward"] = stats.mean_reward
             scalars["Train/mean_episode_length"] = stats.mean_episode_length
+            # Weights & Biases has one count of steps, and a time axis of its own.
+            if self.logger_type != "wandb":
+                over_time["Train/mean_reward/time"] = stats.mean_reward
+                over_time["Train/mean_episode_length/time"] = stats.mean_episode_length
+            if self._uses_rnd:
+                scalars["Rnd/mean_extrinsic_reward"] = statistics.fmean(self.erewbuffer)
+                scalars["Rnd/mean_intrinsic_reward"] = statistics.fmean(self.irewbuffer)
         if rnd_weight is not None:
             scalars["Rnd/weight"] = rnd_weight
         self.write_scalars(scalars, iteration)
+        self.write_scalars(over_time, int(self.tot_time))
 
-    def write_scalars(self, scalars: dict[str, float], iteration: int) -> None:
-        """Write `scalars` to the event file, if this process has one.
+    def write_scalars(self, scalars: dict[str, float], step: int) -> None:
+        """Write `scalars` at `step` (usually the iteration) to the event file, if there is one.
 
         A disk that is full does not end training here: the next checkpoint says it clearly.
         """
@@ -185,7 +229,7 @@ class RunLogger(Logger):
             return
         try:
             for tag, value in scalars.items():
-                self.writer.add_scalar(tag, value, iteration)
+                self.writer.add_scalar(tag, value, step)
         except OSError as error:
             self._write_failed = True
             logger.warning("Figures are no longer written to %s: %s", self.log_dir, error)
@@ -239,6 +283,15 @@ class RunLogger(Logger):
         self.tot_time = state["total_time"]
         self.rewbuffer.extend(state["rewards"])
         self.lenbuffer.extend(state["lengths"])
+
+
+def _writer_config(wanted: str | dict[str, Any], cfg: dict[str, Any]) -> str | dict[str, Any]:
+    """Return what rsl_rl makes the writer from."""
+    if wanted == "wandb":
+        wanted = {"class_name": "WandbLogWriter", "project_name": cfg.get("wandb_project")}
+    if isinstance(wanted, dict) and wanted.get("class_name") == "WandbLogWriter":
+        enable_wandb()
+    return wanted
 
 
 def _is_of_wandb(error: BaseException) -> bool:

@@ -1,0 +1,168 @@
+"""What a run writes, beside rsl_rl's own logger, and what subclasses of the runner read of it."""
+
+from __future__ import annotations
+
+import os
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from mjlab.rl import MjlabOnPolicyRunner
+from mjlab.rl.plot import plot_run, read_scalars
+from mjlab.rl.rsl import Logger, OnPolicyRunner
+from mjlab.rl.run_logger import RunLogger
+
+NUM_ENVS, STEPS = 3, 4
+
+
+class Writer:
+    """Keeps figures as (tag, step)."""
+
+    def __init__(self) -> None:
+        self.figures: dict[tuple[str, int], float] = {}
+
+    def add_scalar(self, tag: str, value: Any, step: int) -> None:
+        assert (tag, step) not in self.figures
+        self.figures[tag, step] = float(value)
+
+
+def make_logger(kind: type[Logger], rnd: bool) -> Any:
+    cfg = {"num_steps_per_env": STEPS, "algorithm": {"rnd_cfg": {"weight": 0.1} if rnd else None}}
+    logger = kind(
+        log_dir="nowhere", cfg=cfg, env_cfg={}, num_envs=NUM_ENVS, is_distributed=False,
+        gpu_world_size=1, gpu_global_rank=0, device="cpu",
+    )  # fmt: skip
+    logger.writer = Writer()  # ty: ignore
+    return logger
+
+
+def feed(logger: Any, rnd: bool, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(STEPS):
+        rewards = torch.randn(NUM_ENVS, generator=generator)
+        intrinsic = torch.rand(NUM_ENVS, generator=generator) if rnd else None
+        # No episode ends in the first iteration.
+        dones = (torch.rand(NUM_ENVS, generator=generator) < (0.4 if seed else 0.0)).long()
+        log = {"plain": 2.0, "Metrics/a": torch.randn(NUM_ENVS, generator=generator)}
+        logger.process_env_step(rewards, dones, {"log": log}, intrinsic)
+
+
+REPORT = {"learning_rate": 1e-3, "action_std": torch.tensor([0.5, 0.7])}
+
+
+@pytest.mark.parametrize("rnd", [False, True])
+@pytest.mark.parametrize("entry", ["finish_iteration", "log"])
+def test_every_tag_of_rsl_rl_is_written_with_its_value_and_step(rnd, entry, capsys):
+    theirs, ours = make_logger(Logger, rnd), make_logger(RunLogger, rnd)
+    for it in range(3):
+        feed(theirs, rnd, it)
+        feed(ours, rnd, it)
+        report = {**REPORT, "rnd_weight": 0.1 if rnd else None}
+        losses, times = {"value": 0.25 * it}, {"collect_time": 0.8, "learn_time": 0.7}
+        theirs.log(it=it, start_it=0, total_it=3, loss_dict=losses, **times, **report)
+        if entry == "log":
+            ours.log(it=it, start_it=0, total_it=3, loss_dict=losses, **times, **report)
+            continue
+        ours.finish_iteration(
+            iteration=it, first_iteration=0, total_iterations=3, losses=losses,
+            collection_time=0.8, learning_time=0.7, **report,
+        )  # fmt: skip
+    expected, written = theirs.writer.figures, ours.writer.figures
+    own = {("Train/mean_step_reward", it) for it in range(3)}
+    # rsl_rl leaves the weight of the curiosity out until an episode has ended.
+    extra = {("Rnd/weight", 0)} if rnd and entry == "finish_iteration" else set()
+    assert written.keys() == expected.keys() | own | extra
+    assert ("Train/mean_reward/time", 4) in expected
+    for key, value in expected.items():
+        assert written[key] == pytest.approx(value, rel=1e-5), key
+
+
+def test_the_type_is_known_once_there_is_a_writer(make_runner, tmp_path: Path):
+    runner = make_runner(tmp_path / "run")
+    assert runner.logger.logger_type is None
+    runner.logger.init_logging_writer()
+    assert runner.logger.logger_type == "tensorboard"
+    runner.logger.stop_logging_writer()
+    silent = make_runner()
+    silent.logger.init_logging_writer()
+    assert silent.logger.logger_type is None
+
+
+class SavesBeside(MjlabOnPolicyRunner):
+    """Overrides `save` as task packages do: the policy goes beside the checkpoint, and upstream."""
+
+    def save(self, path: str, infos: dict | None = None) -> None:
+        super().save(path, infos)
+        folder, file = os.path.split(path)
+        self.export_policy_to_onnx(folder, file.replace(".pt", ".onnx"))
+        if self.logger.disable_logs:
+            return
+        if self.logger.logger_type in ["wandb"]:
+            sys.modules["wandb"].save(os.path.join(folder, "theirs.onnx"), base_path=folder)
+        rewards = self.logger.rewbuffer
+        self.seen = {
+            "type": self.logger.logger_type,
+            "config": self.cfg["logger"],
+            "log_dir": self.logger.log_dir,
+            "reward": sum(rewards) / len(rewards) if rewards else None,
+            "steps": self.logger.tot_timesteps,
+        }
+        if self.logger.writer is not None:
+            self.logger.writer.add_scalar("Theirs/saved", 1.0, self.current_learning_iteration)
+
+
+def test_a_runner_that_overrides_save_reads_what_rsl_rl_offered(make_runner, tmp_path: Path):
+    run = tmp_path / "run"
+    runner = make_runner(run, runner_cls=SavesBeside, env_cfg={"always_terminate": True})
+    runner.add_git_repo_to_log(__file__)
+    runner.learn(2)
+    assert {"model_1.pt", "model_1.onnx"} <= {path.name for path in run.iterdir()}
+    assert runner.seen["type"] == runner.seen["config"] == "tensorboard"
+    assert runner.seen["log_dir"] == str(run)
+    assert runner.seen["reward"] > 0.0
+    assert runner.seen["steps"] == 2 * 5 * 8
+    assert read_scalars(run, "Theirs/saved")[0].tolist()[-1] == 2
+
+
+@pytest.mark.parametrize("logger", ["wandb", {"class_name": "WandbLogWriter", "project_name": "p"}])
+def test_weights_and_biases_is_known_by_its_name_and_the_config_stays(
+    make_runner, tmp_path: Path, monkeypatch, logger
+):
+    saved: list[str] = []
+    client: Any = types.ModuleType("wandb")
+    for name in ("init", "log", "finish"):
+        setattr(client, name, lambda *args, **kwargs: None)
+    client.save = lambda path, **kwargs: saved.append(Path(path).name)
+    client.config = types.SimpleNamespace(update=lambda values: None)
+    monkeypatch.setitem(sys.modules, "wandb", client)
+    runner = make_runner(tmp_path / "run", runner_cls=SavesBeside, logger=logger)
+    runner.learn(1)
+    assert runner.seen["type"] == "wandb"
+    assert runner.seen["config"] == logger
+    assert "theirs.onnx" in saved
+
+
+class OwnLoop(MjlabOnPolicyRunner):
+    """Has a training loop of its own, here rsl_rl's."""
+
+    learn = OnPolicyRunner.learn
+
+
+def test_a_runner_with_a_loop_of_its_own_leaves_checkpoints_and_figures(
+    make_runner, tmp_path: Path, capsys
+):
+    run = tmp_path / "run"
+    runner = make_runner(run, runner_cls=OwnLoop, env_cfg={"always_terminate": True})
+    runner.learn(2)
+    assert len(runner.logger.rewbuffer) == 2 * 5 * 8
+    assert (run / "model_1.pt").is_file()
+    assert "Mean reward" in capsys.readouterr().out
+    for tag in ("Train/mean_reward", "Train/mean_step_reward", "Loss/value"):
+        assert read_scalars(run, tag)[0].tolist() == [0, 1]
+    assert plot_run(run).is_file()
+    other = make_runner(tmp_path / "other")
+    other.load(str(run / "model_1.pt"))
