@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import re
 import sys
 import textwrap
 import tomllib
@@ -124,12 +125,13 @@ def test_a_broken_package_is_reported_with_its_traceback_and_skipped(
     assert "mjlab[compat]" not in record.getMessage()
 
 
-def _extra(name: str) -> list[str]:
-    pyproject = Path(__file__).parents[2] / "pyproject.toml"
-    return tomllib.loads(pyproject.read_text())["project"]["optional-dependencies"][name]
+def _modules_of_the_extra() -> list[str]:
+    pyproject = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    extra = pyproject["project"]["optional-dependencies"]["compat"]
+    return [re.split(r"[^\w]", requirement)[0] for requirement in extra]
 
 
-@pytest.mark.parametrize("module", _extra("compat"))
+@pytest.mark.parametrize("module", _modules_of_the_extra())
 @pytest.mark.parametrize(
     "text",
     [
