@@ -136,8 +136,8 @@ def test_episodes_are_played_in_as_many_environments_as_asked_for(run, flags, nu
 def test_evaluation_prints_a_table_for_people(run, trained):
     outcome = run("evaluate", TASK, *SHORT, "--log-root", str(trained.parents[1]))
     assert outcome.status == 0, outcome.err
-    for part in ("4 in 4 environments", "Mean return", "95 % interval", "Success      0.0%", "at least 900", "native",
-                 "Note         4 of 4 episodes were cut off", "rare failures"):  # fmt: skip
+    for part in ("4 in 4 environments", "Mean return", "95 % interval", "Success      0.0%",
+                 "at least 900", "native", "Note         4 of 4 episodes were cut off", "rare failures"):  # fmt: skip
         assert part in outcome.out
 
 
