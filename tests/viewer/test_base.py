@@ -185,3 +185,30 @@ def test_rates_are_logged_for_those_who_ask_for_detail(caplog) -> None:
 def test_a_frame_rate_that_is_not_positive_is_refused() -> None:
     with pytest.raises(ValueError, match="frame_rate is 0"):
         ListViewer(FakeEnv(1), push(), frame_rate=0)
+
+
+def test_a_subclass_adds_statistics_every_tick() -> None:
+    class Viewer(ListViewer):
+        def _update_stats(self) -> None:
+            super()._update_stats()
+            self.events.append("stats")
+
+    viewer = Viewer(FakeEnv(1), push())
+    viewer.tick()
+    viewer.toggle_pause()
+    viewer.tick()
+    assert viewer.events.count("stats") == 2
+
+
+def test_a_subclass_offers_other_speeds() -> None:
+    class Viewer(ListViewer):
+        SPEED_MULTIPLIERS = [0.1, 0.9, 20.0]
+
+    viewer = Viewer(FakeEnv(1), push())
+    assert viewer.target_realtime == 0.9
+    viewer.increase_speed()
+    viewer.increase_speed()
+    assert viewer.get_status().speed_multiplier == 20.0
+    viewer.reset_speed()
+    assert viewer.target_realtime == 0.9
+    assert [2.0**n for n in range(-5, 4)] == BaseViewer.SPEED_MULTIPLIERS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from types import SimpleNamespace
 
 import mujoco
@@ -13,9 +14,11 @@ from viewer_fakes import FakeEnv, push
 from mjlab.viewer import NativeMujocoViewer, RenderingUnavailableError, ViewerConfig
 from mjlab.viewer.base import ViewerAction
 from mjlab.viewer.history import TermHistory
+from mjlab.viewer.native import keys
 from mjlab.viewer.native.keys import _ACTIONS, action_of_key
 from mjlab.viewer.native.perturbation import MousePush
 from mjlab.viewer.native.reward_plots import plot_scale, reward_figures
+from mjlab.viewer.native.viewer import PlotCfg, compute_viewports, make_empty_figure
 
 
 def test_keys_are_none_that_mujocos_window_uses_itself() -> None:
@@ -65,6 +68,83 @@ def test_the_marker_hangs_over_the_followed_body() -> None:
     board = SimpleNamespace(add_arrow=lambda start, end, *_, **__: drawn.append((start, end)))
     viewer._mark_selected(board)
     np.testing.assert_allclose(drawn[0][1], [1.5, 0.0, 1.5])
+
+
+def test_key_codes_are_those_of_glfw() -> None:
+    import glfw
+
+    ours = {name: code for name, code in vars(keys).items() if name.startswith("KEY_")}
+    assert len(ours) > 100
+    for name, code in ours.items():
+        if name != "KEY_HELP":
+            assert code == getattr(glfw, name), name
+
+
+class TestDebugDrawing:
+    """What subclasses change: `_update_debug_visualizers` and `_show_debug_vis`."""
+
+    @pytest.fixture(autouse=True)
+    def _setup(self) -> None:
+        self.env = FakeEnv(1)
+        model = self.env.sim.mj_model
+        self.handle = SimpleNamespace(
+            user_scn=mujoco.MjvScene(model, maxgeom=100),
+            lock=contextlib.nullcontext,
+            is_running=lambda: True,
+            set_texts=lambda texts: None,
+            sync=lambda: None,
+        )
+
+    def show(self, viewer: NativeMujocoViewer) -> int:
+        viewer._handle = self.handle
+        viewer.sync_env_to_viewer()
+        return self.handle.user_scn.ngeom
+
+    def test_a_subclass_draws_more_in_every_frame(self) -> None:
+        class Viewer(NativeMujocoViewer):
+            def _update_debug_visualizers(self, viewer) -> None:
+                super()._update_debug_visualizers(viewer)
+                mujoco.mjv_initGeom(
+                    viewer.user_scn.geoms[viewer.user_scn.ngeom],
+                    mujoco.mjtGeom.mjGEOM_SPHERE, np.ones(3), np.zeros(3), np.eye(3).ravel(),
+                    np.ones(4, np.float32),
+                )  # fmt: skip
+                viewer.user_scn.ngeom += 1
+
+        plain = self.show(NativeMujocoViewer(self.env, push()))
+        extended = Viewer(self.env, push())
+        assert [self.show(extended), self.show(extended)] == [plain + 1, plain + 1]
+
+    def test_switched_off_nothing_is_drawn(self) -> None:
+        viewer = NativeMujocoViewer(self.env, push())
+        assert viewer._show_debug_vis
+        assert self.show(viewer) > 0
+        viewer.request_action("toggle_debug_vis")
+        viewer._process_actions()
+        assert not viewer._show_debug_vis
+        assert self.show(viewer) == 0
+
+    def test_the_camera_follows_the_bodys_origin_if_centers_of_mass_differ(self) -> None:
+        self.env.cfg.viewer = ViewerConfig(
+            origin_type=ViewerConfig.OriginType.ASSET_ROOT, entity_name="cartpole"
+        )
+        self.handle.cam = mujoco.MjvCamera()
+        self.env.sim.expand("body_mass", torch.ones(1, self.env.sim.mj_model.nbody))
+        self.env.sim.datas[0].qpos[0] = 0.7
+        viewer = NativeMujocoViewer(self.env, push())
+        self.show(viewer)
+        np.testing.assert_allclose(self.handle.cam.lookat, [0.7, 0.0, 1.0])
+
+
+def test_the_model_and_the_state_in_view_are_there_for_subclasses() -> None:
+    env = FakeEnv(2)
+    env.sim.expand("geom_rgba", torch.rand(2, env.sim.mj_model.ngeom, 4))
+    env.sim.datas[1].qpos[0] = 0.5
+    viewer = NativeMujocoViewer(env, push())
+    viewer.select_env(1)
+    viewer._load_selected()
+    np.testing.assert_allclose(viewer.mjm.geom_rgba, env.sim.model.geom_rgba[1])
+    assert viewer.mjd.qpos[0] == pytest.approx(0.5)
 
 
 class TestMousePush:
@@ -124,7 +204,7 @@ class TestRewardPlots:
     def test_the_range_leaves_outliers_out_and_pads_by_a_quarter(self) -> None:
         values = np.linspace(1.0, 2.0, 101)
         values[50] = 900.0
-        exponent, low, high = plot_scale(values)
+        exponent, low, high = plot_scale(values, PlotCfg())
         assert exponent == 0
         assert low == pytest.approx(1.02 - 0.25 * 0.97, abs=0.02)
         assert high == pytest.approx(1.99 + 0.25 * 0.97, abs=0.02)
@@ -133,15 +213,60 @@ class TestRewardPlots:
         ("magnitude", "exponent"), [(0.01, 0), (999.0, 0), (1000.0, 3), (0.004, -3), (0.0, 0)]
     )
     def test_magnitudes_that_read_badly_are_scaled(self, magnitude, exponent) -> None:
-        assert plot_scale(np.array([0.0, magnitude]))[0] == exponent
+        assert plot_scale(np.array([0.0, magnitude]), PlotCfg())[0] == exponent
 
     def test_at_most_twelve_terms_in_two_columns_inside_the_window(self) -> None:
         history = TermHistory(300)
         history.add([(f"term{i}", [float(i)]) for i in range(20)])
         history.add([(f"term{i}", [float("nan")]) for i in range(20)])
-        figures = reward_figures(history, mujoco.MjrRect(0, 0, 1000, 600))
+        figures = reward_figures(history, mujoco.MjrRect(0, 0, 1200, 600), PlotCfg())
         assert len(figures) == 12
-        assert {rect.left for rect, _ in figures} == {780, 560}
+        assert {rect.left for rect, _ in figures} == {1000, 800}
         assert all(0 <= rect.bottom <= 500 for rect, _ in figures)
         assert figures[0][1].title == "term0"
         assert figures[3][1].linepnt[0] == 1  # NaN is left out.
+
+    @pytest.mark.parametrize("num_plots", [0, 1, 5, 7, 12, 30])
+    @pytest.mark.parametrize("changes", [{}, {"max_viewports": 20, "max_rows_per_col": 5}])
+    def test_plots_fill_their_strip_without_overlap(self, num_plots, changes) -> None:
+        cfg = PlotCfg(**changes)
+        rect = mujoco.MjrRect(10, 20, 1200, 900)
+        places = compute_viewports(num_plots, rect, cfg)
+        assert len(places) == min(num_plots, cfg.max_viewports)
+        corners = {(place.left, place.bottom) for place in places}
+        assert len(corners) == len(places)
+        for place in places:
+            assert place.left >= 10 + 1200 * (1 - cfg.plot_strip_fraction) - 1
+            assert place.left + place.width <= 1210
+            assert place.bottom >= 20
+            assert place.bottom + place.height <= 920
+            assert place.height <= 900 // cfg.min_rows_per_col
+        if num_plots:
+            assert places[0].left + places[0].width == 1210
+            assert places[0].bottom + places[0].height == 920
+
+    def test_the_viewer_plots_what_its_config_asks_for(self) -> None:
+        cfg = PlotCfg(history=5, max_viewports=1, background_alpha=0.2, grid_size=(2, 6))
+        viewer = NativeMujocoViewer(FakeEnv(1), push(), 60.0, None, cfg)
+        for _ in range(8):
+            viewer.step_simulation()
+        shown = []
+        viewer._handle = SimpleNamespace(
+            user_scn=mujoco.MjvScene(viewer.mjm, maxgeom=100), lock=contextlib.nullcontext,
+            is_running=lambda: True, set_texts=lambda texts: None, sync=lambda: None,
+            viewport=mujoco.MjrRect(0, 0, 600, 400), set_figures=shown.extend,
+        )  # fmt: skip
+        viewer._show_plots = True
+        viewer.sync_env_to_viewer()
+        [(_, figure)] = shown
+        assert figure.linepnt[0] == 5
+        assert list(figure.gridsize) == [2, 6]
+        assert figure.figurergba[3] == pytest.approx(0.2)
+
+    def test_an_empty_figure_has_points_at_past_steps(self) -> None:
+        figure = make_empty_figure("title", (3, 4), (-1.0, 2.0), 50, 0.3)
+        np.testing.assert_array_equal(figure.linedata[0, :100:2], -np.arange(50))
+        assert not figure.linedata[0, 1:100:2].any()
+        assert list(figure.range[1]) == [-1.0, 2.0]
+        assert figure.title == "title"
+        assert make_empty_figure("long", (3, 4), (0.0, 1.0), 5000, 0.3).linedata[0, 2000] == -1000

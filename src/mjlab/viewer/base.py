@@ -9,13 +9,13 @@ import time
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 
 from mjlab.compat import older_names
 from mjlab.viewer.interrupt import first_interrupt_calls
-from mjlab.viewer.pacing import RateMeter, RealtimePacer, speed_label
+from mjlab.viewer.pacing import SPEEDS, RateMeter, RealtimePacer, speed_label
 from mjlab.viewer.protocols import EnvProtocol as EnvProtocol
 from mjlab.viewer.protocols import PolicyProtocol as PolicyProtocol
 from mjlab.viewer.protocols import VerbosityLevel as VerbosityLevel
@@ -35,6 +35,9 @@ class BaseViewer(ABC):
     Everything that touches the environment happens in the thread that calls `run`. Buttons and
     keys, whose callbacks arrive in other threads, put actions into a queue (`request_action`).
     """
+
+    SPEED_MULTIPLIERS: ClassVar[list[float]] = list(SPEEDS)
+    """Selectable speeds, as multiples of real time, in rising order."""
 
     def __init__(
         self,
@@ -62,7 +65,9 @@ class BaseViewer(ABC):
         self.frame_time = 1.0 / frame_rate
         self.verbosity = VerbosityLevel(verbosity)
         self.cfg = env.unwrapped.cfg.viewer
-        self._pacer = RealtimePacer(float(env.unwrapped.step_dt), self.frame_time)
+        self._pacer = RealtimePacer(
+            float(env.unwrapped.step_dt), self.frame_time, self.SPEED_MULTIPLIERS
+        )
         self._actions: queue.SimpleQueue[tuple[ViewerAction, Any]] = queue.SimpleQueue()
         self._paused = False
         self._step_count = 0
@@ -140,8 +145,7 @@ class BaseViewer(ABC):
         if not self._paused:
             self._pacer.add(elapsed)
             self._step_within_budget()
-        if self._rates.update(time.perf_counter()):
-            self.log_performance()
+        self._update_stats()
         return self._show_frame_if_due()
 
     def step_simulation(self) -> bool:
@@ -156,6 +160,11 @@ class BaseViewer(ABC):
             self.after_env_step()
             return True
         return False
+
+    def _update_stats(self) -> None:
+        """Average the rates of steps and frames; called every tick, subclasses may add theirs."""
+        if self._rates.update(time.perf_counter()):
+            self.log_performance()
 
     def _limit_reached(self) -> bool:
         return self._step_limit is not None and self._total_steps >= self._step_limit

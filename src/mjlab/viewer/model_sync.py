@@ -67,6 +67,9 @@ VIEWER_MODEL_FIELDS = frozenset(
 )
 """Per-environment model fields that change what is drawn; viewers copy these and no others."""
 
+VIEWER_INERTIAL_FIELDS = frozenset({"body_mass", "body_ipos"})
+"""Fields that move the center of mass, which MuJoCo's tracking camera follows."""
+
 _STATE_FIELDS = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "time")
 
 
@@ -144,7 +147,9 @@ def compute_poses(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 def to_numpy(value: Any) -> np.ndarray:
-    """A host array, whether `value` is a torch tensor on any device, an array or a number."""
+    """A host array from a torch tensor or a Warp array on any device, an array or a number."""
     if hasattr(value, "detach"):
-        value = value.detach().cpu().numpy()
+        value = value.detach().cpu()
+    if hasattr(value, "numpy"):
+        value = value.numpy()
     return np.asarray(value)

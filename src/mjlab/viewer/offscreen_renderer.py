@@ -12,6 +12,7 @@ import numpy as np
 from mjlab.viewer.backdrop import has_sky, move_sun, paint_sky, prepare_sun
 from mjlab.viewer.camera import nearest_envs, resolve_camera
 from mjlab.viewer.gl_context import open_renderer
+from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS as VIEWER_MODEL_FIELDS
 from mjlab.viewer.model_sync import (
     compute_poses,
     copy_state,

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 SPEEDS = tuple(2.0**exponent for exponent in range(-5, 4))
 """Speeds a viewer offers, as multiples of real time: 1/32, 1/16, ... 8."""
 
@@ -22,24 +25,27 @@ class RealtimePacer:
     that is slower than asked for runs late, and the screen still answers.
     """
 
-    def __init__(self, step_dt: float, frame_period: float):
+    def __init__(self, step_dt: float, frame_period: float, speeds: Sequence[float] = SPEEDS):
         self.step_dt = step_dt
         self.frame_period = frame_period
         self.capped = False
-        self._speed_index = SPEEDS.index(1.0)
+        self._speeds = tuple(speeds)
         self._budget = 0.0
+        self.reset_speed()
 
     @property
     def speed(self) -> float:
         """Target speed as a multiple of real time."""
-        return SPEEDS[self._speed_index]
+        return self._speeds[self._speed_index]
 
     def change_speed(self, steps: int) -> None:
         """Go `steps` up (or down, where negative) in the list of speeds, within its ends."""
-        self._speed_index = min(max(self._speed_index + steps, 0), len(SPEEDS) - 1)
+        self._speed_index = min(max(self._speed_index + steps, 0), len(self._speeds) - 1)
 
     def reset_speed(self) -> None:
-        self._speed_index = SPEEDS.index(1.0)
+        """Select real time, or the speed nearest to it."""
+        ratios = [abs(math.log(speed)) for speed in self._speeds]
+        self._speed_index = ratios.index(min(ratios))
 
     def add(self, elapsed: float) -> None:
         """Add `elapsed` seconds of wall time to the budget."""

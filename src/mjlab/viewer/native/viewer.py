@@ -15,6 +15,8 @@ from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction
 from mjlab.viewer.camera import first_moving_body, nearest_envs, resolve_camera
 from mjlab.viewer.errors import RenderingUnavailableError
 from mjlab.viewer.history import TermHistory
+from mjlab.viewer.model_sync import VIEWER_INERTIAL_FIELDS as VIEWER_INERTIAL_FIELDS
+from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS as VIEWER_MODEL_FIELDS
 from mjlab.viewer.model_sync import (
     compute_poses,
     copy_state,
@@ -25,7 +27,10 @@ from mjlab.viewer.model_sync import (
 from mjlab.viewer.native.display import require_display
 from mjlab.viewer.native.keys import KEY_HELP, action_of_key
 from mjlab.viewer.native.perturbation import MousePush
-from mjlab.viewer.native.reward_plots import PLOT_POINTS, reward_figures
+from mjlab.viewer.native.reward_plots import PlotCfg as PlotCfg
+from mjlab.viewer.native.reward_plots import compute_viewports as compute_viewports
+from mjlab.viewer.native.reward_plots import make_empty_figure as make_empty_figure
+from mjlab.viewer.native.reward_plots import reward_figures
 from mjlab.viewer.native.visualizer import MujocoNativeDebugVisualizer
 
 if TYPE_CHECKING:
@@ -46,6 +51,11 @@ class NativeMujocoViewer(BaseViewer):
     Double-click selects a body, Ctrl-drag pushes or twists it. Keys are listed in the window;
     they are ones that MuJoCo's window does not use itself. What is computed for display (contacts,
     say) comes from a CPU forward pass, also where the environment runs on a GPU.
+
+    Attributes:
+        mjm: Private copy of the model, with the values of the environment in view.
+        mjd: State of the environment in view.
+        env_idx: Environment in view.
     """
 
     def __init__(
@@ -54,6 +64,7 @@ class NativeMujocoViewer(BaseViewer):
         policy: PolicyProtocol,
         frame_rate: float = 60.0,
         key_callback: Callable[[int], None] | None = None,
+        plot_cfg: PlotCfg | None = None,
         enable_perturbations: bool = True,
         verbosity: int = VerbosityLevel.SILENT,
     ) -> None:
@@ -64,32 +75,34 @@ class NativeMujocoViewer(BaseViewer):
             policy: Maps observations to actions.
             frame_rate: Displayed frames per second of wall time.
             key_callback: Also called with every key (GLFW code), in the window's thread.
-            enable_perturbations: Whether the mouse can push bodies.
+            plot_cfg: Size and range of the reward plots.
+            enable_perturbations: Let the mouse push bodies.
             verbosity: How much to log, a `VerbosityLevel`.
         """
         super().__init__(env, policy, frame_rate, verbosity)
         self._user_key_callback = key_callback
         self._enable_perturbations = enable_perturbations
         unwrapped = env.unwrapped
-        self._model = host_model(unwrapped.sim.mj_model)
-        prepare_sun(self._model, self.cfg.distance)
+        self.mjm = host_model(unwrapped.sim.mj_model)
+        prepare_sun(self.mjm, self.cfg.distance)
         # Neighbours are posed in a model of their own, so that the window's is changed only
         # while it is locked.
         self._extra_model = host_model(unwrapped.sim.mj_model)
-        self._data = mujoco.MjData(self._model)
+        self.mjd = mujoco.MjData(self.mjm)
         self._extra_data = mujoco.MjData(self._extra_model)
-        self._view = resolve_camera(self.cfg, self._model, unwrapped.scene.entities)
+        self._view = resolve_camera(self.cfg, self.mjm, unwrapped.scene.entities)
         if self._view.fovy is not None:
-            self._model.vis.global_.fovy = self._view.fovy
+            self.mjm.vis.global_.fovy = self._view.fovy
         self._marked_body = (
-            self._view.body_id if self._view.body_id is not None else first_moving_body(self._model)
+            self._view.body_id if self._view.body_id is not None else first_moving_body(self.mjm)
         )
         self.env_idx = min(max(self.cfg.env_idx, 0), unwrapped.num_envs - 1)
-        self._rewards = TermHistory(PLOT_POINTS)
-        self._push = MousePush(self._model)
+        self._plot_cfg = plot_cfg if plot_cfg is not None else PlotCfg()
+        self._rewards = TermHistory(self._plot_cfg.history)
+        self._push = MousePush(self.mjm)
         self._show_plots = False
-        self._show_debug = True
-        self._show_all_debug = False
+        self._show_debug_vis = True
+        self._show_all_envs = False
         self._handle: mujoco.viewer.Handle | None = None
         self._window_threads: set[threading.Thread] = set()
         self._visualizer: MujocoNativeDebugVisualizer | None = None
@@ -107,8 +120,8 @@ class NativeMujocoViewer(BaseViewer):
         others = set(threading.enumerate())
         try:
             self._handle = mujoco.viewer.launch_passive(
-                self._model,
-                self._data,
+                self.mjm,
+                self.mjd,
                 key_callback=self._on_key,
                 show_left_ui=False,
                 show_right_ui=False,
@@ -140,10 +153,10 @@ class NativeMujocoViewer(BaseViewer):
             return
         with handle.lock():
             self._load_selected()
-            self._draw_extras(handle.user_scn)
+            self._draw_extras(handle)
         handle.set_texts(self._overlay())
         if self._show_plots and handle.viewport is not None:
-            handle.set_figures(reward_figures(self._rewards, handle.viewport))
+            handle.set_figures(reward_figures(self._rewards, handle.viewport, self._plot_cfg))
         handle.sync()
 
     def sync_viewer_to_env(self) -> None:
@@ -153,7 +166,7 @@ class NativeMujocoViewer(BaseViewer):
         # Without a push there is nothing to wait for the window's lock for.
         if handle.perturb.active or self._push.active:
             with handle.lock():
-                self._push.apply(self.env.unwrapped.sim, self.env_idx, self._data, handle.perturb)
+                self._push.apply(self.env.unwrapped.sim, self.env_idx, self.mjd, handle.perturb)
 
     def after_env_step(self) -> None:
         manager = self.env.unwrapped.reward_manager
@@ -173,9 +186,9 @@ class NativeMujocoViewer(BaseViewer):
             if not self._show_plots and self._handle is not None:
                 self._handle.clear_figures()
         elif action is ViewerAction.TOGGLE_DEBUG_VIS:
-            self._show_debug = not self._show_debug
+            self._show_debug_vis = not self._show_debug_vis
         elif action is ViewerAction.TOGGLE_SHOW_ALL_ENVS:
-            self._show_all_debug = not self._show_all_debug
+            self._show_all_envs = not self._show_all_envs
         else:
             return False
         return True
@@ -197,11 +210,11 @@ class NativeMujocoViewer(BaseViewer):
     def _configure_window(self, handle: mujoco.viewer.Handle) -> None:
         with handle.lock():
             camera = handle.cam
-            camera.lookat[:] = self._view.target(self._data.xpos)
+            camera.lookat[:] = self._view.target(self.mjd.xpos)
             camera.distance = self._view.distance
             camera.azimuth = self._view.azimuth
             camera.elevation = self._view.elevation
-            if self._view.body_id is not None:
+            if self._view.body_id is not None and not self._com_differs:
                 camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
                 camera.trackbodyid = self._view.body_id
             handle.opt.frame = mujoco.mjtFrame.mjFRAME_WORLD
@@ -211,33 +224,53 @@ class NativeMujocoViewer(BaseViewer):
             flags = handle.user_scn.flags
             flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self.cfg.enable_shadows
             flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = self.cfg.enable_reflections
-        self._visualizer = MujocoNativeDebugVisualizer(handle.user_scn, self._model)
 
     def _load_selected(self) -> None:
         sim = self.env.unwrapped.sim
         if sim.expanded_fields:
-            sync_model_fields(self._model, sim.model, sim.expanded_fields, self.env_idx)
-        copy_state(sim, self.env_idx, self._data)
-        mujoco.mj_forward(self._model, self._data)
-        move_sun(self._model, self._data, self._view.target(self._data.xpos))
+            sync_model_fields(self.mjm, sim.model, sim.expanded_fields, self.env_idx)
+        copy_state(sim, self.env_idx, self.mjd)
+        mujoco.mj_forward(self.mjm, self.mjd)
+        move_sun(self.mjm, self.mjd, self._view.target(self.mjd.xpos))
 
-    def _draw_extras(self, scn: mujoco.MjvScene) -> None:
-        scn.ngeom = 0
-        visualizer = self._visualizer
-        if visualizer is None:
-            return
-        visualizer.begin(self.env_idx, self._show_all_debug)
-        if self._show_debug:
-            self.env.unwrapped.update_visualizers(visualizer)
+    def _draw_extras(self, viewer: mujoco.viewer.Handle) -> None:
+        self._update_debug_visualizers(viewer)
+        if self._view.body_id is not None and self._com_differs:
+            viewer.cam.lookat[:] = self._view.target(self.mjd.xpos)
         if self.env.unwrapped.num_envs > 1:
-            self._mark_selected(visualizer)
-            self._draw_neighbours(scn)
+            self._mark_selected(self._visualizer_of(viewer.user_scn))
+            self._draw_neighbours(viewer.user_scn)
+
+    def _update_debug_visualizers(self, viewer: mujoco.viewer.Handle) -> None:
+        """Replace the geoms of `viewer.user_scn` by the environment's debug drawings.
+
+        Called for every displayed frame with the window locked, also while `_show_debug_vis` is
+        False. Subclasses may extend it to draw more.
+        """
+        viewer.user_scn.ngeom = 0
+        if self._show_debug_vis:
+            visualizer = self._visualizer_of(viewer.user_scn)
+            visualizer.begin(self.env_idx, self._show_all_envs)
+            self.env.unwrapped.update_visualizers(visualizer)
+
+    def _visualizer_of(self, scn: mujoco.MjvScene) -> MujocoNativeDebugVisualizer:
+        if self._visualizer is None or self._visualizer.scn is not scn:
+            self._visualizer = MujocoNativeDebugVisualizer(scn, self.mjm)
+        return self._visualizer
+
+    @property
+    def _com_differs(self) -> bool:
+        """True if the center of mass, which a tracking camera follows, differs per environment.
+
+        The camera then follows the body's origin, so that it does not jump between environments.
+        """
+        return bool(self.env.unwrapped.sim.expanded_fields & VIEWER_INERTIAL_FIELDS)
 
     def _mark_selected(self, visualizer: MujocoNativeDebugVisualizer) -> None:
         """Hang a red arrow over the followed body of the environment in view."""
         if self._marked_body is None:
             return
-        tip = self._data.xpos[self._marked_body] + np.array([0.0, 0.0, 0.5])
+        tip = self.mjd.xpos[self._marked_body] + np.array([0.0, 0.0, 0.5])
         visualizer.add_arrow(tip + np.array([0.0, 0.0, 0.4]), tip, _MARKER_COLOR, width=0.03)
 
     def _draw_neighbours(self, scn: mujoco.MjvScene) -> None:
