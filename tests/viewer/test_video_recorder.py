@@ -51,6 +51,19 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir()) if folder.exists() else []
 
 
+def test_of_a_batch_of_images_the_clip_shows_environment_0(tmp_path) -> None:
+    class Batched(FilmedEnv):
+        def render(self):
+            return np.stack([super().render(), np.full((*self.shape, 3), 200, np.uint8)])
+
+    env = VideoRecorder(Batched(), tmp_path, step_trigger=lambda n: n == 0, video_length=3)
+    for _ in range(3):
+        env.step(ACTION)
+    [path] = env.written
+    brightness = frames(path).mean(axis=(1, 2, 3))
+    np.testing.assert_allclose(brightness, [10, 20, 30], atol=3)
+
+
 def test_a_clip_starts_at_its_step_and_holds_the_frames_after_each_step(tmp_path) -> None:
     env = VideoRecorder(
         FilmedEnv(), tmp_path / "clips", step_trigger=lambda n: n == 2, video_length=4

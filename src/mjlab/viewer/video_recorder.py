@@ -183,7 +183,9 @@ class VideoRecorder(ManagerBasedRlEnv):
         try:
             frame = self.env.render()
             if frame is not None:
-                self._clip.add(np.asarray(frame))
+                image = np.asarray(frame)
+                # Of one image per environment, (n, H, W, 3), the clip shows environment 0.
+                self._clip.add(image[0] if image.ndim == 4 else image)
         except RenderingUnavailableError as error:
             self.unavailable_reason = str(error)
             self._finish_clip()
