@@ -24,7 +24,7 @@ from mjlab.terrains.config import ALL_TERRAIN_PRESETS
 from mjlab.viewer.gl_context import open_renderer
 from mjlab.viewer.offscreen_renderer import OffscreenRenderer
 from mjlab.viewer.viewer_config import ViewerConfig
-from mjlab.viewer.viser.camera_feeds import depth_colors, segmentation_colors
+from mjlab.viewer.viser.camera_viewer import depth_colors, segmentation_colors
 
 _IMAGES = Path(__file__).parent / "images"
 

@@ -91,8 +91,8 @@ def test_contacts_of_shapes_larger_than_compiled_are_found_on_the_host() -> None
 
 def test_the_page_draws_each_environment_with_its_own_shapes(viser_server) -> None:
     sim = of_all_things()
-    scene = MjlabViserScene(viser_server, sim.mj_model, 5)
-    scene.draw(sim, None)
+    scene = MjlabViserScene(viser_server, sim.mj_model, 5, sim.model, sim.expanded_fields)
+    scene.update(sim)
     shapes = scene._variants._shapes.values()
     body, lid = sim.mj_model.body("thing/thing").id, sim.mj_model.body("thing/lid").id
     of_things = sorted(tuple(shape.envs) for shape in shapes if body in shape.bodies)

@@ -14,11 +14,7 @@ from viewer_fakes import FakeEnv
 
 from mjlab.viewer.debug_visualizer import DebugVisualizer, NullDebugVisualizer
 from mjlab.viewer.native import MujocoNativeDebugVisualizer
-from mjlab.viewer.viser.debug_items import (
-    ViserDebugVisualizer,
-    _direction,
-    rotation_quat_from_vectors,
-)
+from mjlab.viewer.viser.debug_items import ViserDebugVisualizer, _direction
 
 MODEL = FakeEnv(1).sim.mj_model
 RED, BLUE = (1.0, 0.0, 0.0, 0.25), (0.0, 0.0, 1.0, 0.75)
@@ -82,11 +78,11 @@ def test_arrows_without_a_length_are_skipped(viser_server) -> None:
         target.add_arrow(np.ones(3), np.ones(3), RED)
     assert board.scn.ngeom == 0
     page.send(np.zeros(3))
-    assert not page._handles
+    assert not page._debug_handles
     page.add_arrow(np.zeros(3), np.ones(3), RED)
     page.add_arrow(np.ones(3), np.ones(3), BLUE)
     page.send(np.zeros(3))
-    assert len(page._handles["shaft"].batched_positions) == 1
+    assert len(page._debug_handles["shaft"].batched_positions) == 1
 
 
 def test_browser_arrows_reach_from_start_to_end_whatever_their_direction(viser_server) -> None:
@@ -96,7 +92,7 @@ def test_browser_arrows_reach_from_start_to_end_whatever_their_direction(viser_s
     for end in ends:
         page.add_arrow(start, start + end, RED, width=0.1)
     page.send(np.zeros(3))
-    head = page._handles["head"]
+    head = page._debug_handles["head"]
     for i, end in enumerate(ends):
         axis = vtf.SO3(np.asarray(head.batched_wxyzs[i], dtype=float)).as_matrix()[:, 2]
         tip = head.batched_positions[i] + head.batched_scales[i][2] * axis
@@ -130,7 +126,7 @@ def test_browser_items_have_their_own_opacity_arrows_included(viser_server) -> N
     page.add_sphere(np.zeros(3), 0.1, BLUE)
     page.send(np.zeros(3))
     for key in ("shaft", "head", "sphere"):
-        np.testing.assert_allclose(page._handles[key].batched_opacities, [0.25, 0.75])
+        np.testing.assert_allclose(page._debug_handles[key].batched_opacities, [0.25, 0.75])
 
 
 def test_browser_items_vanish_when_they_are_not_drawn_again_and_move_with_the_scene(
@@ -139,12 +135,12 @@ def test_browser_items_vanish_when_they_are_not_drawn_again_and_move_with_the_sc
     page = ViserDebugVisualizer(viser_server, MODEL)
     page.add_sphere(np.array([1.0, 2.0, 3.0]), 0.1, RED)
     page.send(np.array([-1.0, 0.0, 0.0]))
-    np.testing.assert_allclose(page._handles["sphere"].batched_positions, [[0, 2, 3]])
+    np.testing.assert_allclose(page._debug_handles["sphere"].batched_positions, [[0, 2, 3]])
     page.clear()
     page.add_box(np.zeros(3), np.ones(3), np.eye(3), BLUE)
     page.send(np.zeros(3))
-    assert not page._handles["sphere"].visible
-    assert page._handles["box"].visible
+    assert not page._debug_handles["sphere"].visible
+    assert page._debug_handles["box"].visible
 
 
 def test_browser_ghosts_show_moving_geoms_with_the_opacity_asked_for(viser_server) -> None:
@@ -152,7 +148,7 @@ def test_browser_ghosts_show_moving_geoms_with_the_opacity_asked_for(viser_serve
     for x in (0.5, -0.5):
         page.add_ghost_mesh(np.array([x, 0.0]), MODEL, alpha=0.3)
     page.send(np.zeros(3))
-    handles = list(page._handles.values())
+    handles = list(page._debug_handles.values())
     assert len(handles) == 2
     np.testing.assert_allclose(handles[0].batched_positions, [[0.5, 0, 1], [-0.5, 0, 1]])
     np.testing.assert_allclose(handles[0].batched_opacities, 0.3, rtol=1e-6)
@@ -164,16 +160,6 @@ def test_the_rotation_of_an_arrow_turns_z_onto_its_direction(vector) -> None:
     length, wxyz, axis = _direction(np.zeros(3), np.array(vector))
     np.testing.assert_allclose(vtf.SO3(wxyz).as_matrix()[:, 2], axis, atol=1e-6)
     np.testing.assert_allclose(length * axis, vector, atol=1e-9)
-
-
-@settings(max_examples=50)
-@given(*[st.tuples(*[st.floats(-5, 5)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-3)] * 2)
-def test_a_rotation_between_vectors_turns_one_onto_the_other(one, other) -> None:
-    for end in (np.array(other), -np.array(one)):
-        turned = vtf.SO3(rotation_quat_from_vectors(np.array(one), end)).apply(np.array(one))
-        np.testing.assert_allclose(
-            turned / np.linalg.norm(turned), end / np.linalg.norm(end), atol=1e-6
-        )
 
 
 def test_straight_down_is_a_direction_too() -> None:

@@ -12,9 +12,8 @@ def test_only_the_latest_points_are_kept_and_averaged_over_finite_ones() -> None
     for value in (1.0, 2.0, float("inf"), 4.0, 6.0):
         history.add([("a", [value])])
     np.testing.assert_array_equal(history.values("a"), [2.0, np.nan, 4.0, 6.0])
-    assert history.mean("a", last=2) == 5.0
-    assert history.mean("a", last=10) == 4.0
+    assert history.mean("a") == 4.0
     history.clear()
     assert history.names == ["a"]
-    assert history.mean("a", last=2) == 0.0
+    assert history.mean("a") == 0.0
     assert len(history.values("unknown")) == 0

@@ -15,24 +15,27 @@ from viewer_fakes import FakeEnv, push
 from mjlab.viewer import ViewerConfig, ViserPlayViewer
 from mjlab.viewer.base import ViewerStatus
 from mjlab.viewer.viewer_config import OriginType
-from mjlab.viewer.viser.checkpoints import Checkpoint, LocalCheckpoints, age, checkpoint_number
+from mjlab.viewer.viser.checkpoints import checkpoint_number, local_checkpoints
 from mjlab.viewer.viser.controls import status_html
-from mjlab.viewer.viser.reward_bars import RewardBarPanel
 from mjlab.viewer.viser.scene import MjlabViserScene
+from mjlab.viewer.viser.viewer import CheckpointManager, UpdateReason, format_time_ago
 
 FOLLOW = {"origin_type": OriginType.ASSET_ROOT, "entity_name": "cartpole"}
 
 
-def make(server, num_envs: int = 2, checkpoints=None, **fields) -> ViserPlayViewer:
+def make(server, num_envs: int = 2, manager=None, **fields) -> ViserPlayViewer:
     env = FakeEnv(num_envs, ViewerConfig(**{**FOLLOW, **fields}))
-    viewer = ViserPlayViewer(env, push(), viser_server=server, checkpoints=checkpoints)
+    viewer = ViserPlayViewer(env, push(), viser_server=server, checkpoint_manager=manager)
     viewer.setup()
-    viewer._panel_period = 0.0
     return viewer
 
 
+def rewards_of(viewer: ViserPlayViewer) -> np.ndarray:
+    return viewer._term_overlays.reward_plotter.history.values("upright")
+
+
 def show(viewer: ViserPlayViewer) -> None:
-    viewer._next_scene = viewer._next_panels = 0.0
+    viewer._next_scene = viewer._next_panels = viewer._term_overlays._next_refresh = 0.0
     viewer.sync_env_to_viewer()
 
 
@@ -93,8 +96,12 @@ def test_histories_get_one_point_a_step_however_often_the_display_is_refreshed(
         viewer.step_simulation()
         show(viewer)
         show(viewer)
-    assert viewer._rewards.values("upright").tolist() == [0.5, 0.5, 0.5]
-    assert viewer._metrics.values("height").tolist() == [1.0, 1.0, 1.0]
+    assert rewards_of(viewer).tolist() == [0.5, 0.5, 0.5]
+    assert viewer._term_overlays.metrics_plotter.history.values("height").tolist() == [
+        1.0,
+        1.0,
+        1.0,
+    ]
 
 
 def test_histories_start_anew_at_a_reset_and_for_another_environment(viser_server) -> None:
@@ -102,9 +109,9 @@ def test_histories_start_anew_at_a_reset_and_for_another_environment(viser_serve
     viewer.step_simulation()
     viewer.scene.env_idx = 1
     viewer.step_simulation()
-    assert viewer._rewards.values("upright").tolist() == [1.0]
+    assert rewards_of(viewer).tolist() == [1.0]
     viewer.reset_environment()
-    assert viewer._rewards.values("upright").tolist() == []
+    assert rewards_of(viewer).tolist() == []
 
 
 def test_what_is_drawn_is_a_copy_taken_between_steps(viser_server) -> None:
@@ -114,10 +121,10 @@ def test_what_is_drawn_is_a_copy_taken_between_steps(viser_server) -> None:
     class Live:
         """Fields that the simulation goes on writing into."""
 
-        mj_model, model, expanded_fields = viewer.env.sim.mj_model, viewer.env.sim.model, set()
         data = rows
+        copy_to_host = None
 
-    viewer.scene.draw(Live, None)
+    viewer.scene.update(Live)
     before = viewer.scene._last_body_xpos.copy()
     rows.xpos += 100.0
     np.testing.assert_array_equal(viewer.scene._last_body_xpos, before)
@@ -126,11 +133,11 @@ def test_what_is_drawn_is_a_copy_taken_between_steps(viser_server) -> None:
 def test_controls_only_ask_for_a_redraw_and_never_draw_themselves(viser_server) -> None:
     viewer = make(viser_server)
     show(viewer)
-    assert not viewer.scene.redraw_requested
+    assert not viewer._update_reasons
     drawn = []
     viewer.scene._update_visualization_locked = lambda *_: drawn.append(1)
     viewer.scene.request_update()  # What mjviser's own controls call.
-    assert viewer.scene.redraw_requested
+    assert viewer._update_reasons == {UpdateReason.SCENE_REQUEST}
     assert not drawn
     show(viewer)
     assert drawn
@@ -142,10 +149,10 @@ def test_each_sensor_that_draws_has_a_switch(viser_server) -> None:
     hits = next(box for box in checkboxes(viser_server) if box.label == "hits")
     assert hits.value
     assert not any(box.label == "silent" for box in checkboxes(viser_server))
-    spheres = viewer.scene.debug._handles["sphere"]
+    spheres = viewer.scene._debug_handles["sphere"]
     assert len(spheres.batched_positions) == 2
     hits.value = False
-    assert viewer.scene.redraw_requested
+    assert viewer._update_reasons == {UpdateReason.SCENE_REQUEST}
     show(viewer)
     assert len(spheres.batched_positions) == 1
 
@@ -205,20 +212,16 @@ class TestCheckpoints:
 
     def test_files_are_sorted_by_number_and_labelled_with_their_age(self, folder) -> None:
         os.utime(folder / "model_50.pt", (time.time() - 300, time.time() - 300))
-        source = LocalCheckpoints(folder, lambda path: push())
-        listed = source.available()
-        assert [item.name for item in listed] == ["model_0.pt", "model_50.pt", "model_1000.pt"]
-        assert listed[1].label(time.time()) == "model_50.pt (5m ago)"
-        assert Checkpoint("x.pt").label(0.0) == "x.pt"
+        source = local_checkpoints(folder, lambda path: push())
+        listed = source.fetch_available()
+        assert [name for name, _ in listed] == ["model_0.pt", "model_50.pt", "model_1000.pt"]
+        assert listed[1][1] == "5m ago"
 
     def test_numbers_and_ages(self) -> None:
         assert [checkpoint_number(n) for n in ("model_12.pt", "best.pt", "a_b_3.pt")] == [12, 0, 0]
-        assert [age(s) for s in (12, 300, 7300, 260000)] == [
-            "12s ago",
-            "5m ago",
-            "2h ago",
-            "3d ago",
-        ]
+        times = (0, 59, 60, 3599, 3600, 86399, 86400, 260000)
+        ages = ["0s", "59s", "1m", "59m", "1h", "23h", "1d", "3d"]
+        assert [format_time_ago(s) for s in times] == [f"{age} ago" for age in ages]
 
     def test_choosing_loads_the_policy_resets_and_clears_the_plots(
         self, viser_server, folder
@@ -230,7 +233,7 @@ class TestCheckpoints:
             loaded.append(path.name)
             return other
 
-        viewer = make(viser_server, checkpoints=LocalCheckpoints(folder, load, "model_1000.pt"))
+        viewer = make(viser_server, manager=local_checkpoints(folder, load, "model_1000.pt"))
         viewer.step_simulation()
         panel = viewer._checkpoint_panel
         panel._choice.value = next(x for x in panel._choice.options if "model_50" in x)
@@ -238,20 +241,41 @@ class TestCheckpoints:
         assert loaded == ["model_50.pt"]
         assert viewer.policy is other
         assert viewer.env.num_resets == 1
-        assert len(viewer._rewards.values("upright")) == 0
+        assert len(rewards_of(viewer)) == 0
         assert "Loaded model_50.pt" in panel._message.content
+
+    def test_a_manager_of_the_caller_names_its_run_and_the_last_entry_is_the_latest(
+        self, viser_server
+    ) -> None:
+        loaded = []
+        manager = CheckpointManager(
+            current_name="model_50.pt",
+            fetch_available=lambda: [("model_50.pt", "2h ago"), ("model_100.pt", "5m ago")],
+            load_checkpoint=lambda name: loaded.append(name) or push(),
+            run_name="a run",
+            run_url="https://example.com/run",
+            run_status="finished",
+        )
+        viewer = make(viser_server, manager=manager)
+        panel = viewer._checkpoint_panel
+        assert panel._choice.value == "model_50.pt (2h ago)"
+        assert "[a run](https://example.com/run) (finished)" in panel._about.content
+        panel._use_latest()
+        viewer._process_actions()
+        assert loaded == ["model_100.pt"]
+        assert manager.current_name == "model_100.pt"
 
     def test_use_latest_looks_for_new_files(self, viser_server, folder) -> None:
         loaded = []
-        source = LocalCheckpoints(folder, lambda path: loaded.append(path.name) or push())
-        viewer = make(viser_server, checkpoints=source)
+        source = local_checkpoints(folder, lambda path: loaded.append(path.name) or push())
+        viewer = make(viser_server, manager=source)
         (folder / "model_2000.pt").touch()
         viewer._checkpoint_panel._use_latest()
         viewer._process_actions()
         assert loaded == ["model_2000.pt"]
 
     def test_listing_again_loads_nothing(self, viser_server, folder) -> None:
-        viewer = make(viser_server, checkpoints=LocalCheckpoints(folder, lambda path: 1 / 0))
+        viewer = make(viser_server, manager=local_checkpoints(folder, lambda path: 1 / 0))
         (folder / "model_2000.pt").touch()
         viewer._checkpoint_panel.refresh()
         assert viewer._actions.empty()
@@ -259,8 +283,8 @@ class TestCheckpoints:
     def test_errors_while_loading_or_listing_are_shown_and_the_old_policy_plays_on(
         self, viser_server, folder
     ) -> None:
-        source = LocalCheckpoints(folder, lambda path: (_ for _ in ()).throw(OSError("truncated")))
-        viewer = make(viser_server, checkpoints=source)
+        source = local_checkpoints(folder, lambda path: (_ for _ in ()).throw(OSError("truncated")))
+        viewer = make(viser_server, manager=source)
         before = viewer.policy
         viewer.request_action("fetch_checkpoint", "model_50.pt")
         viewer._process_actions()
@@ -268,21 +292,9 @@ class TestCheckpoints:
         assert viewer.policy is before
         assert not viewer.get_status().paused
         assert "Cannot load model_50.pt: truncated" in panel._message.content
-        source.available = lambda: 1 / 0
+        source.fetch_available = lambda: 1 / 0
         panel.refresh()
         assert "Cannot list checkpoints" in panel._message.content
-
-
-def test_reward_bars_are_cut_with_a_warning_and_compare_with_the_largest(
-    viser_server, caplog
-) -> None:
-    with caplog.at_level(logging.WARNING):
-        panel = RewardBarPanel(viser_server, ["a", "b<", "c"], max_terms=2)
-    assert "3 terms" in caplog.text
-    panel._show({"a": 2.0, "b<": -1.0})
-    assert "width:100.0%" in panel._html.content
-    assert "width:50.0%" in panel._html.content
-    assert "b&lt;" in panel._html.content
 
 
 def test_shapes_that_differ_between_environments_are_drawn_as_each_has_them(
@@ -294,9 +306,10 @@ def test_shapes_that_differ_between_environments_are_drawn_as_each_has_them(
     size = torch.as_tensor(model.geom_size).float().expand(3, -1, -1).clone()
     size[2, cart] = torch.tensor([0.4, 0.3, 0.2])
     env.sim.expand("geom_size", size)
-    scene = MjlabViserScene(viser_server, model, 3)
+    scene = MjlabViserScene(viser_server, model, 3, env.sim.model, env.sim.expanded_fields)
+    scene.camera_tracking_enabled = False
     batches = len(scene._mesh_groups)
-    scene.draw(env.sim, None)
+    scene.update(env.sim)
     shapes = list(scene._variants._shapes.values())
     assert [(shape.envs, len(shape.bodies)) for shape in shapes] == [([0, 1], 2), ([2], 1)]
     assert len(scene._mesh_groups) == batches - 1  # The pole is still mjviser's.
@@ -304,7 +317,7 @@ def test_shapes_that_differ_between_environments_are_drawn_as_each_has_them(
     # Equal again: one shape for all.
     size[2, cart] = size[0, cart]
     scene._variants._next_check = 0.0
-    scene.draw(env.sim, None)
+    scene.update(env.sim)
     assert [shape.envs for shape in scene._variants._shapes.values()] == [[0, 1, 2]]
 
 
@@ -315,9 +328,27 @@ def test_a_shape_that_differs_is_found_behind_others_that_do_not(viser_server) -
     rgba = torch.as_tensor(model.geom_rgba).float().expand(2, -1, -1).clone()
     rgba[1, pole, :3] = 0.9
     env.sim.expand("geom_rgba", rgba)
-    scene = MjlabViserScene(viser_server, model, 2)
+    scene = MjlabViserScene(viser_server, model, 2, env.sim.model, env.sim.expanded_fields)
     # Its batch is the last one.
     scene._mesh_groups.sort(key=lambda batch: model.geom_bodyid[pole] in batch.body_ids)
     assert len(scene._mesh_groups) > 1
-    scene.draw(env.sim, None)
+    scene.update(env.sim)
     assert [shape.envs for shape in scene._variants._shapes.values()] == [[0], [1]]
+
+
+def test_switching_the_environment_removes_the_drawings_of_the_old_one(viser_server) -> None:
+    viewer = make(viser_server)
+    show(viewer)
+    viewer.env.update_visualizers = lambda visualizer: None
+    select = next(
+        handle
+        for handle in viser_server.gui._gui_input_handle_from_uuid.values()
+        if handle.label == "Select" and type(handle).__name__ == "GuiSliderHandle"
+    )
+    assert viewer.scene._debug_handles
+    select.value = 1
+    assert viewer._update_reasons == {UpdateReason.SCENE_REQUEST}
+    show(viewer)
+    assert viewer.scene.env_idx == 1
+    assert not viewer.scene._debug_handles
+    assert "environment 1" in viewer._term_overlays.reward_plotter._label.content

@@ -10,6 +10,7 @@ import numpy as np
 import viser
 
 from mjlab.utils.nan_guard import NanDump
+from mjlab.viewer.camera import whole_model_view
 from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS, host_model
 from mjlab.viewer.viser.scene import MjlabViserScene
 
@@ -47,7 +48,8 @@ class NanPage:
         gui = server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         dump.apply(dump.steps[-1], 0, self.model, self.data)
-        self.scene = MjlabViserScene(server, self.model, 1)
+        view = whole_model_view(self.model)
+        self.scene = MjlabViserScene(server, self.model, 1, view=view)
         self.scene.set_refresh_handler(self._changed.set)
         tabs = gui.add_tab_group()
         with tabs.add_tab("States", icon=viser.Icon.BUG):
@@ -61,7 +63,7 @@ class NanPage:
                 visible=len(self._envs) > 1, hint="Which of the recorded environments.",
             )  # fmt: skip
             with gui.add_folder("Scene"):
-                self.scene.create_scene_gui()
+                self.scene.create_scene_gui(show_debug_viz_control=False)
         with tabs.add_tab("Visualization", icon=viser.Icon.EYE):
             self.scene.create_overlay_gui()
         with tabs.add_tab("Groups", icon=viser.Icon.LAYERS_INTERSECT):

@@ -113,16 +113,16 @@ def _make_viewer(
 
         return NativeMujocoViewer(env, policy)
     from mjlab.viewer import ViserPlayViewer
-    from mjlab.viewer.viser.checkpoints import LocalCheckpoints
+    from mjlab.viewer.viser.checkpoints import local_checkpoints
 
-    source = None
+    manager = None
     if checkpoint is not None and any(checkpoint.parent.glob("*.pt")):
-        source = LocalCheckpoints(
+        manager = local_checkpoints(
             checkpoint.parent,
             lambda path: load_policy(task, env, path, device, cfg.profile),
             current=checkpoint.name,
         )
-    viewer = ViserPlayViewer(env, policy, checkpoints=source, host=cfg.host, port=cfg.port)
+    viewer = ViserPlayViewer(env, policy, checkpoint_manager=manager, host=cfg.host, port=cfg.port)
     print(f"Open {viewer.url} in a browser. Ctrl-C ends.", flush=True)
     if cfg.open_browser and _can_open_browser():
         import webbrowser

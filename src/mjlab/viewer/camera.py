@@ -93,6 +93,19 @@ def _view_of_model_camera(cfg: ViewerConfig, model: mujoco.MjModel) -> CameraVie
     )
 
 
+def whole_model_view(model: mujoco.MjModel) -> CameraView:
+    """Return a fixed view of the whole model."""
+    x, y, z = (float(value) for value in model.stat.center)
+    return CameraView(
+        body_id=None,
+        lookat=(x, y, z),
+        distance=3.0 * float(model.stat.extent),
+        azimuth=120.0,
+        elevation=-20.0,
+        fovy=None,
+    )
+
+
 def first_moving_body(model: mujoco.MjModel) -> int | None:
     """Id of the first body that can move; below a mocap root, bodies count as moving."""
     for body_id in range(1, model.nbody):

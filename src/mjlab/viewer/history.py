@@ -25,7 +25,7 @@ class TermHistory:
         A value that is not finite is recorded as NaN, which plots leave out.
         """
         for name, values in terms:
-            value = float(values[0])
+            value = float(np.ravel(values)[0])
             series = self._values.setdefault(name, deque(maxlen=self.length))
             series.append(value if np.isfinite(value) else float("nan"))
 
@@ -33,11 +33,11 @@ class TermHistory:
         """Points of one term, (count,), the latest last."""
         return np.array(self._values.get(name, ()), dtype=float)
 
-    def mean(self, name: str, last: int) -> float:
-        """Mean of the last `last` finite points; 0 where there are none."""
-        recent = self.values(name)[-last:]
-        recent = recent[np.isfinite(recent)]
-        return float(recent.mean()) if len(recent) else 0.0
+    def mean(self, name: str) -> float:
+        """Mean of the finite points; 0 without any."""
+        values = self.values(name)
+        finite = values[np.isfinite(values)]
+        return float(finite.mean()) if len(finite) else 0.0
 
     def clear(self) -> None:
         """Forget the points, keep the names."""

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import viser
 
@@ -22,71 +22,51 @@ log = logging.getLogger(__name__)
 _NONE_FOUND = "(none)"
 
 
-@dataclass(frozen=True)
-class Checkpoint:
-    """A checkpoint that can be chosen."""
+@dataclass
+class CheckpointManager:
+    """Checkpoints of a run that the viewer can play."""
 
-    name: str
-    """File name, which `load` takes."""
-    modified: float | None = None
-    """When it was written, in seconds since 1970."""
-
-    def label(self, now: float) -> str:
-        """Name and age, as the list shows it."""
-        return self.name if self.modified is None else f"{self.name} ({age(now - self.modified)})"
-
-
-class CheckpointSource(Protocol):
-    """Where checkpoints come from: a run folder, a W&B run, ..."""
-
-    @property
-    def description(self) -> str:
-        """Markdown that names the source, its status, a link."""
-        ...
-
-    def available(self) -> list[Checkpoint]:
-        """What there is now, oldest first. Called outside the main thread."""
-        ...
-
-    def load(self, name: str) -> PolicyProtocol:
-        """The policy of one of them. Called in the main thread."""
-        ...
+    current_name: str
+    """Name of the checkpoint in use."""
+    fetch_available: Callable[[], list[tuple[str, str]]]
+    """Function that lists (name, age) of the checkpoints, oldest first. Called in a thread of the
+    server."""
+    load_checkpoint: Callable[[str], PolicyProtocol]
+    """Function that returns the policy of a checkpoint by name. Called in the viewer's thread."""
+    run_name: str | None = None
+    """Name of the run. None: checkpoints are local files."""
+    run_url: str | None = None
+    """Address of the run's page."""
+    run_status: str | None = None
+    """Status of the run."""
 
 
-class LocalCheckpoints:
-    """The `*.pt` files of a run folder."""
+def local_checkpoints(
+    folder: Path, load_policy: Callable[[Path], PolicyProtocol], current: str = ""
+) -> CheckpointManager:
+    """Return a manager of the `*.pt` files in `folder`; `current` is the one in use."""
 
-    def __init__(
-        self,
-        folder: Path,
-        load_policy: Callable[[Path], PolicyProtocol],
-        current: str | None = None,
-    ):
-        """List `folder`, load with `load_policy`; `current` is the file in use at the start."""
-        self.folder = Path(folder)
-        self.current = current
-        self._load_policy = load_policy
+    def fetch_available() -> list[tuple[str, str]]:
+        files = sorted(folder.glob("*.pt"), key=lambda path: checkpoint_number(path.name))
+        now = time.time()
+        return [(file.name, format_time_ago(int(now - file.stat().st_mtime))) for file in files]
 
-    @property
-    def description(self) -> str:
-        return f"**Local:** `{self.folder}`"
-
-    def available(self) -> list[Checkpoint]:
-        files = sorted(self.folder.glob("*.pt"), key=lambda path: checkpoint_number(path.name))
-        return [Checkpoint(path.name, path.stat().st_mtime) for path in files]
-
-    def load(self, name: str) -> PolicyProtocol:
-        return self._load_policy(self.folder / name)
+    return CheckpointManager(
+        current_name=current,
+        fetch_available=fetch_available,
+        load_checkpoint=lambda name: load_policy(folder / name),
+        run_name=str(folder),
+    )
 
 
 def checkpoint_number(name: str) -> int:
-    """The number after the first underscore of a checkpoint's name; 0 where there is none."""
+    """Return the number after the first underscore of a checkpoint's name, or 0."""
     match = re.match(r"[^_]*_(\d+)", name)
     return int(match.group(1)) if match else 0
 
 
-def age(seconds: float) -> str:
-    """A time span as `12s ago`, `5m ago`, `2h ago` or `3d ago`."""
+def format_time_ago(seconds: int) -> str:
+    """Return a time span as `12s ago`, `5m ago`, `2h ago` or `3d ago`."""
     for unit, length in (("d", 86400), ("h", 3600), ("m", 60)):
         if seconds >= length:
             return f"{int(seconds // length)}{unit} ago"
@@ -99,17 +79,17 @@ class CheckpointPanel:
     def __init__(
         self,
         server: viser.ViserServer,
-        source: CheckpointSource,
+        manager: CheckpointManager,
         request_load: Callable[[str], None],
     ):
         """Add the panel to the current place in the page and list what there is.
 
         Args:
             server: The page's server.
-            source: Where checkpoints come from.
+            manager: Lists and loads checkpoints.
             request_load: Asks the main thread to load a checkpoint by name.
         """
-        self._source = source
+        self._manager = manager
         self._request_load = request_load
         self._labels: dict[str, str] = {}
         # Setting the list's value calls its callback, as a person's choice does.
@@ -124,26 +104,27 @@ class CheckpointPanel:
         latest.on_click(lambda _: self._use_latest())
         sync.on_click(lambda _: self.refresh())
         self.refresh()
-        self.select(getattr(source, "current", None))
+        self.select(manager.current_name)
 
     def refresh(self) -> None:
         """List the source again, keeping the choice where it still exists."""
         try:
-            checkpoints = self._source.available()
-            self._about.content = self._source.description
+            checkpoints = self._manager.fetch_available()
         except Exception as error:
             log.exception("Cannot list checkpoints.")
             self.show_error(f"Cannot list checkpoints: {error}")
             return
-        now = time.time()
+        self._about.content = _describe(self._manager)
         chosen = self._labels.get(self._choice.value)
         # The newest first: that is the one people look for.
-        self._labels = {item.label(now): item.name for item in reversed(checkpoints)}
+        self._labels = {
+            f"{name} ({age})" if age else name: name for name, age in reversed(checkpoints)
+        }
         self._quietly("options", list(self._labels) or [_NONE_FOUND])
-        self.select(chosen)
+        self.select(chosen or self._manager.current_name)
         self._show(f"{len(checkpoints)} found.")
 
-    def select(self, name: str | None) -> None:
+    def select(self, name: str) -> None:
         """Show `name` as the chosen one, without loading it."""
         for label, candidate in self._labels.items():
             if candidate == name:
@@ -151,6 +132,7 @@ class CheckpointPanel:
 
     def show_loaded(self, name: str) -> None:
         """Say that `name` is in use."""
+        self._manager.current_name = name
         self.select(name)
         self._show(f"Loaded {name}.")
 
@@ -180,3 +162,13 @@ class CheckpointPanel:
         self.refresh()
         if self._labels:
             self._request_load(next(iter(self._labels.values())))
+
+
+def _describe(manager: CheckpointManager) -> str:
+    if manager.run_name is None:
+        return "**Local checkpoints**"
+    name = f"`{manager.run_name}`"
+    if manager.run_url is not None:
+        name = f"[{manager.run_name}]({manager.run_url})"
+    status = "" if manager.run_status is None else f" ({manager.run_status})"
+    return f"**Run:** {name}{status}"

@@ -6,13 +6,16 @@ from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
+import torch
 import trimesh
 import viser
 import viser.transforms as vtf
 from mjviser.conversions import is_fixed_body, merge_geoms
 
 from mjlab.viewer.debug_visualizer import MIN_LENGTH, Color, DebugVisualizer, pose_ghost
-from mjlab.viewer.model_sync import compute_poses
+from mjlab.viewer.model_sync import compute_poses, to_numpy
+
+Array = np.ndarray | torch.Tensor
 
 _HEAD_FRACTION = 0.2
 _HEAD_WIDENING = 2.0
@@ -38,9 +41,9 @@ class _Batch:
     colors: list[Color] = field(default_factory=list)
 
     def add(self, position, wxyz, scale, color: Color) -> None:
-        self.positions.append(np.array(position, dtype=np.float32))
+        self.positions.append(np.array(to_numpy(position), dtype=np.float32))
         self.wxyzs.append(wxyz)
-        self.scales.append(scale)
+        self.scales.append(to_numpy(scale))
         self.colors.append(color)
 
     def extend(self, positions, wxyzs, scales, colors: list[Color]) -> None:
@@ -91,7 +94,7 @@ class ViserDebugVisualizer(DebugVisualizer):
         self._meshes = _unit_meshes()
         self._batches: dict[str, _Batch] = {}
         self._arrows = _Arrows()
-        self._handles: dict[str, viser.BatchedMeshHandle] = {}
+        self._debug_handles: dict[str, viser.BatchedMeshHandle] = {}
         self._ghosts: dict[int, tuple[mujoco.MjModel, mujoco.MjData, list[int]]] = {}
 
     @property
@@ -102,44 +105,51 @@ class ViserDebugVisualizer(DebugVisualizer):
         self._batches.clear()
         self._arrows = _Arrows()
 
+    def clear_debug_all(self) -> None:
+        """Remove everything drawn, from the page too."""
+        self.clear()
+        for handle in self._debug_handles.values():
+            handle.remove()
+        self._debug_handles.clear()
+
     def add_arrow(
         self,
-        start: np.ndarray,
-        end: np.ndarray,
+        start: Array,
+        end: Array,
         color: Color,
         width: float = 0.015,
         label: str | None = None,
     ) -> None:
         arrows = self._arrows
-        arrows.starts.append(np.array(start, dtype=float))
-        arrows.ends.append(np.array(end, dtype=float))
+        arrows.starts.append(np.array(to_numpy(start), dtype=float))
+        arrows.ends.append(np.array(to_numpy(end), dtype=float))
         arrows.widths.append(width)
         arrows.colors.append(color)
 
     def add_cylinder(
         self,
-        start: np.ndarray,
-        end: np.ndarray,
+        start: Array,
+        end: Array,
         radius: float,
         color: Color,
         label: str | None = None,
     ) -> None:
-        start = np.asarray(start, dtype=float).reshape(3)
+        start, end = to_numpy(start).reshape(3), to_numpy(end).reshape(3)
         length, wxyz, axis = _direction(start, end)
         if length >= MIN_LENGTH:
             middle = start + 0.5 * length * axis
             self._add("shaft", middle, wxyz, (radius, radius, length), color)
 
     def add_sphere(
-        self, center: np.ndarray, radius: float, color: Color, label: str | None = None
+        self, center: Array, radius: float, color: Color, label: str | None = None
     ) -> None:
         self._add("sphere", center, (1.0, 0.0, 0.0, 0.0), (radius, radius, radius), color)
 
     def add_ellipsoid(
         self,
-        center: np.ndarray,
-        size: np.ndarray,
-        mat: np.ndarray,
+        center: Array,
+        size: Array,
+        mat: Array,
         color: Color,
         label: str | None = None,
     ) -> None:
@@ -147,9 +157,9 @@ class ViserDebugVisualizer(DebugVisualizer):
 
     def add_box(
         self,
-        center: np.ndarray,
-        size: np.ndarray,
-        mat: np.ndarray,
+        center: Array,
+        size: Array,
+        mat: Array,
         color: Color,
         label: str | None = None,
     ) -> None:
@@ -157,10 +167,10 @@ class ViserDebugVisualizer(DebugVisualizer):
 
     def add_ghost_mesh(
         self,
-        qpos: np.ndarray,
+        qpos: Array,
         model: mujoco.MjModel,
-        mocap_pos: np.ndarray | None = None,
-        mocap_quat: np.ndarray | None = None,
+        mocap_pos: Array | None = None,
+        mocap_quat: Array | None = None,
         alpha: float = 0.5,
         label: str | None = None,
     ) -> None:
@@ -168,7 +178,8 @@ class ViserDebugVisualizer(DebugVisualizer):
             # The model is kept too, so that its id cannot be reused by another model.
             self._ghosts[id(model)] = (model, mujoco.MjData(model), self._ghost_meshes(model))
         _, data, geom_ids = self._ghosts[id(model)]
-        pose_ghost(data, qpos, mocap_pos, mocap_quat)
+        mocap = (None if pose is None else to_numpy(pose) for pose in (mocap_pos, mocap_quat))
+        pose_ghost(data, to_numpy(qpos), *mocap)
         compute_poses(model, data)
         for geom_id in geom_ids:
             body_id = model.geom_bodyid[geom_id]
@@ -181,12 +192,25 @@ class ViserDebugVisualizer(DebugVisualizer):
                 (red, green, blue, alpha),
             )
 
+    def add_frame(
+        self,
+        position: Array,
+        rotation_matrix: Array,
+        scale: float = 0.3,
+        label: str | None = None,
+        axis_radius: float = 0.01,
+        alpha: float = 1.0,
+        axis_colors: tuple[tuple[float, float, float], ...] | None = None,
+    ) -> None:
+        position, rotation = to_numpy(position), to_numpy(rotation_matrix)
+        super().add_frame(position, rotation, scale, label, axis_radius, alpha, axis_colors)
+
     def send(self, offset: np.ndarray) -> None:
         """Show this frame's items, moved by `offset` (3,), and hide what was not drawn again."""
         self._batch_arrows()
         for key, batch in self._batches.items():
             self._send_batch(key, batch, offset)
-        for key, handle in self._handles.items():
+        for key, handle in self._debug_handles.items():
             if key not in self._batches and handle.visible:
                 handle.visible = False
 
@@ -207,7 +231,7 @@ class ViserDebugVisualizer(DebugVisualizer):
         arrows, self._arrows = self._arrows, _Arrows()
         if not arrows.starts:
             return
-        shafts, heads = self._batches.get("shaft", _Batch()), _Batch()
+        shafts, heads = (self._batches.get(key, _Batch()) for key in ("shaft", "head"))
         arrows.add_to(shafts, heads)
         if heads.positions:
             self._batches["shaft"], self._batches["head"] = shafts, heads
@@ -222,10 +246,10 @@ class ViserDebugVisualizer(DebugVisualizer):
         scales = np.array(batch.scales, dtype=np.float32).reshape(-1, 3)
         rgba = np.clip(np.array(batch.colors, dtype=np.float32), 0.0, 1.0)
         colors = (rgba[:, :3] * 255).astype(np.uint8)
-        handle = self._handles.get(key)
+        handle = self._debug_handles.get(key)
         if handle is None:
             mesh = self._meshes[key]
-            self._handles[key] = self._server.scene.add_batched_meshes_simple(
+            self._debug_handles[key] = self._server.scene.add_batched_meshes_simple(
                 f"/debug/{key}",
                 np.asarray(mesh.vertices, dtype=np.float32),
                 np.asarray(mesh.faces, dtype=np.uint32),
@@ -257,20 +281,8 @@ def _geom_rgba(model: mujoco.MjModel, geom_id: int) -> np.ndarray:
     return model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom_id]
 
 
-def _wxyz(mat: np.ndarray) -> np.ndarray:
-    return vtf.SO3.from_matrix(np.asarray(mat, dtype=float).reshape(3, 3)).wxyz
-
-
-def rotation_quat_from_vectors(from_vec: np.ndarray, to_vec: np.ndarray) -> np.ndarray:
-    """A rotation (w, x, y, z) that turns the direction of one vector (3,) onto another's."""
-    start = from_vec / np.linalg.norm(from_vec)
-    end = to_vec / np.linalg.norm(to_vec)
-    wxyz = np.array([1.0 + start @ end, *np.cross(start, end)])
-    if np.linalg.norm(wxyz) < 1e-8:
-        # Opposite directions: half a turn about any axis at right angles to them.
-        helper = np.eye(3)[np.argmin(np.abs(start))]
-        wxyz = np.array([0.0, *np.cross(start, helper)])
-    return wxyz / np.linalg.norm(wxyz)
+def _wxyz(mat: Array) -> np.ndarray:
+    return vtf.SO3.from_matrix(to_numpy(mat).astype(float).reshape(3, 3)).wxyz
 
 
 def _direction(start: np.ndarray, end: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

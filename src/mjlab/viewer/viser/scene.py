@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import mujoco
@@ -11,8 +12,10 @@ import numpy as np
 import viser
 from mjviser import ViserMujocoScene
 
-from mjlab.viewer.camera import CameraView, first_moving_body
-from mjlab.viewer.model_sync import sync_model_fields, to_numpy
+from mjlab.compat import accepts_older_methods
+from mjlab.viewer.camera import CameraView, first_moving_body, whole_model_view
+from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS as VIEWER_MODEL_FIELDS
+from mjlab.viewer.model_sync import copy_state, host_model, sync_model_fields, to_numpy
 from mjlab.viewer.viser.debug_items import ViserDebugVisualizer
 from mjlab.viewer.viser.variants import GeomVariants
 
@@ -21,12 +24,14 @@ _DEFAULT_FOV = 60.0
 _CONTACT_WIDENING = 4.2
 
 
-class MjlabViserScene(ViserMujocoScene):
-    """mjviser's scene of all environments, seen through the camera of a `ViewerConfig`.
+@accepts_older_methods
+class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
+    """mjviser's scene of all environments, a debug visualizer, and a camera.
 
-    Following a body moves the scene, not the camera, so that the person keeps control of it. All
-    drawing happens in the thread that calls `draw`; the page's controls only set values and ask
-    for a redraw (`redraw_requested`).
+    Following a body moves the scene, not the camera, so that the person keeps control of it.
+    `add_*` queues debug drawings, which `update` and its siblings show until `clear`. A control of
+    the page redraws the last state in a thread of the server; where the state belongs to another
+    thread, `set_refresh_handler` lets controls only ask for a redraw.
     """
 
     def __init__(
@@ -34,6 +39,9 @@ class MjlabViserScene(ViserMujocoScene):
         server: viser.ViserServer,
         mj_model: mujoco.MjModel,
         num_envs: int,
+        sim_model: Any | None = None,
+        expanded_fields: set[str] | None = None,
+        *,
         view: CameraView | None = None,
         geom_group: tuple[int, ...] = (1, 1, 1, 0, 0, 0),
         site_group: tuple[int, ...] = (1, 1, 1, 0, 0, 0),
@@ -42,71 +50,101 @@ class MjlabViserScene(ViserMujocoScene):
 
         Args:
             server: The page's server.
-            mj_model: The compiled scene. mjviser writes colours and sizes into its visual
-                settings, so give it a private copy (`model_sync.host_model`).
-            num_envs: Environments to draw.
-            view: Camera; by default MuJoCo's for the whole model.
-            geom_group: Which geom groups are shown at first.
-            site_group: Which site groups are shown at first.
+            mj_model: The compiled scene. mjviser writes colors and sizes into its visual settings.
+            num_envs: Number of environments to draw.
+            sim_model: Batched model, to draw the randomized fields of each environment. The scene
+                then works on a copy of `mj_model`.
+            expanded_fields: Names of the per-environment fields of `sim_model`.
+            view: Camera. None: the whole model, then the arguments of `create_scene_gui`.
+            geom_group: Geom groups that are visible at first.
+            site_group: Site groups that are visible at first.
         """
-        super().__init__(server, mj_model, num_envs)
+        if sim_model is not None:
+            mj_model = host_model(mj_model)
+        ViserMujocoScene.__init__(self, server, mj_model, num_envs)
+        ViserDebugVisualizer.__init__(self, server, mj_model)
         # As mjviser has them, contact points disappear in a robot's feet.
         mj_model.vis.scale.contactwidth *= _CONTACT_WIDENING
-        self.view = view if view is not None else _whole_model_view(mj_model)
+        self._has_own_view = view is not None
+        self.view = view if view is not None else whole_model_view(mj_model)
         self.geom_groups_visible = [bool(shown) for shown in geom_group]
         self.site_groups_visible = [bool(shown) for shown in site_group]
         self._sync_visibilities()
-        followed = self.view.body_id
-        self.camera_tracking_enabled = followed is not None
-        self._tracked_body_id = followed if followed is not None else first_moving_body(mj_model)
-        self.debug = ViserDebugVisualizer(server, mj_model)
-        self.debug_enabled = True
-        self.show_all_debug = False
-        self.offset = np.zeros(3)
-        """How far the scene was moved when it was drawn last, (3,)."""
-        self._variants = GeomVariants(self)
-        self._redraw = threading.Event()
-        self.set_refresh_handler(self._redraw.set)
+        self._tracked_body_id = first_moving_body(mj_model)
+        if view is not None:
+            self.camera_tracking_enabled = view.body_id is not None
+            self._tracked_body_id = view.body_id or self._tracked_body_id
+        self.debug_visualization_enabled = True
+        self.show_all_envs = False
+        self._sim_model = sim_model
+        self._expanded_fields = (expanded_fields or set()) if sim_model is not None else set()
+        self._variants = GeomVariants(self, sim_model, self._expanded_fields)
         self._aim_initial_camera()
 
     @property
-    def redraw_requested(self) -> bool:
-        """Whether a control was changed since the last `draw`."""
-        return self._redraw.is_set()
+    def offset(self) -> np.ndarray:
+        """Translation of the scene when it was drawn last, (3,)."""
+        return self._scene_offset
 
-    def request_redraw(self) -> None:
-        """Ask for a redraw, from any thread."""
-        self._redraw.set()
+    @property
+    def meansize(self) -> float:
+        """Typical size of a body (m), or `meansize_override`."""
+        override = self.meansize_override
+        return float(self.mj_model.stat.meansize) if override is None else override
 
-    def draw(self, sim: Any, debug_vis: Callable[[ViserDebugVisualizer], None] | None) -> None:
+    def get_env_indices(self, num_envs: int) -> Iterable[int]:
+        """Return the environments that debug drawings are for: of the visible ones."""
+        if self.show_only_selected:
+            return (self.env_idx,) if self.env_idx < num_envs else ()
+        return super().get_env_indices(num_envs)
+
+    def update(self, wp_data: Any, env_idx: int | None = None) -> None:
         """Show the present state of all environments; call it between steps.
 
         Args:
-            sim: The simulation. What is drawn is copied here, before anything is sent.
-            debug_vis: Draws the overlays of the selected (or of all) environments.
+            wp_data: A `Simulation` or its data. Everything drawn is copied before it is sent.
+            env_idx: Environment whose overlays are drawn and whose body is followed. None: the
+                selected one.
         """
-        self._redraw.clear()
-        env_idx = self.env_idx
-        arrays = {
-            name: to_numpy(getattr(sim.data, name)).copy()
-            for name in ("xpos", "xmat", "mocap_pos", "mocap_quat")
-            if not name.startswith("mocap") or self.mj_model.nmocap > 0
-        }
-        xmat = arrays["xmat"].reshape(*arrays["xpos"].shape[:2], 3, 3)
-        self.offset = offset = self._offset(arrays["xpos"][env_idx])
-        mj_data = self._forward_selected(sim, env_idx)
-        with self._update_lock, self.server.atomic():
-            self._variants.update(sim, arrays["xpos"], xmat, offset)
-            self._update_visualization_locked(
-                arrays["xpos"],
-                xmat,
-                arrays.get("mocap_pos", np.zeros((self.num_envs, 0, 3))),
-                arrays.get("mocap_quat", np.zeros((self.num_envs, 0, 4))),
-                env_idx,
-                offset,
-                mj_data,
-            )
-            self._draw_debug(debug_vis, env_idx, offset)
+        if env_idx is None:
+            env_idx = self.env_idx
+        data = wp_data.data if hasattr(wp_data, "copy_to_host") else wp_data
+        body_xpos = to_numpy(data.xpos).copy()
+        body_xmat = to_numpy(data.xmat).reshape(*body_xpos.shape[:2], 3, 3).copy()
+        mocap_pos, mocap_quat = np.zeros((self.num_envs, 0, 3)), np.zeros((self.num_envs, 0, 4))
+        if self.mj_model.nmocap > 0:
+            mocap_pos = to_numpy(data.mocap_pos).copy()
+            mocap_quat = to_numpy(data.mocap_quat).copy()
+        mj_data = None
+        if self._any_decor_visible():
+            self._sync_model_fields(env_idx)
+            copy_state(wp_data, env_idx, self.mj_data)
+            mujoco.mj_forward(self.mj_model, self.mj_data)
+            mj_data = self.mj_data
+        offset = self._offset(body_xpos[env_idx])
+        self._update_visualization(
+            body_xpos, body_xmat, mocap_pos, mocap_quat, env_idx, offset, mj_data
+        )
+
+    def update_from_arrays(
+        self,
+        body_xpos: np.ndarray,
+        body_xmat: np.ndarray,
+        mocap_pos: np.ndarray | None = None,
+        mocap_quat: np.ndarray | None = None,
+        env_idx: int | None = None,
+        qpos: np.ndarray | None = None,
+        qvel: np.ndarray | None = None,
+        ctrl: np.ndarray | None = None,
+    ) -> None:
+        """Show body poses; (num_envs, nbody, 3) and (num_envs, nbody, 3, 3).
+
+        `qpos` and `qvel` are for contacts and other overlays that MuJoCo computes.
+        """
+        self._sync_model_fields(self.env_idx if env_idx is None else env_idx)
+        super().update_from_arrays(
+            body_xpos, body_xmat, mocap_pos, mocap_quat, env_idx, qpos, qvel, ctrl
+        )
 
     def aim(self) -> None:
         """Put every connected camera where the configuration wants it."""
@@ -116,43 +154,100 @@ class MjlabViserScene(ViserMujocoScene):
 
     def create_scene_gui(
         self,
-        camera_distance: float = -1.0,
-        camera_azimuth: float = 120.0,
-        camera_elevation: float = 20.0,
+        camera_distance: float = 3.0,
+        camera_azimuth: float = 45.0,
+        camera_elevation: float = 30.0,
+        show_debug_viz_control: bool = True,
+        debug_viz_extra_gui: Callable[[], None] | None = None,
     ) -> None:
-        """Add the environment and camera controls; the camera's pose is that of `view`."""
+        """Add environment, camera and debug controls to the current place in the page.
+
+        Args:
+            camera_distance: Distance of the camera (m), unless the scene was given a `view`. Not
+                positive: the whole model is in view.
+            camera_azimuth: Azimuth of that camera in degrees.
+            camera_elevation: Elevation of that camera in degrees; positive is above the scene.
+            show_debug_viz_control: Add the switches of debug drawings.
+            debug_viz_extra_gui: Called to add more switches beside those.
+        """
+        if not self._has_own_view:
+            self.view = dataclasses.replace(
+                self.view,
+                distance=camera_distance if camera_distance > 0 else self.view.distance,
+                azimuth=camera_azimuth,
+                elevation=-camera_elevation,
+            )
+            self._aim_initial_camera()
+        gui = self.server.gui
         if self.num_envs > 1:
-            with self.server.gui.add_folder("Environment"):
+            with gui.add_folder("Environment"):
                 self._create_environment_gui()
-        with self.server.gui.add_folder("Camera"):
+        with gui.add_folder("Camera"):
             self._create_camera_gui()
+        if show_debug_viz_control:
+            with gui.add_folder("Debug Viz"):
+                self._create_debug_viz_gui()
+                if debug_viz_extra_gui is not None:
+                    debug_viz_extra_gui()
+
+    def create_visualization_gui(
+        self,
+        camera_distance: float = 3.0,
+        camera_azimuth: float = 45.0,
+        camera_elevation: float = 30.0,
+        show_debug_viz_control: bool = True,
+        debug_viz_extra_gui: Callable[[], None] | None = None,
+    ) -> viser.GuiTabGroupHandle:
+        """Add tabs of scene, overlay and group controls; arguments as in `create_scene_gui`."""
+        tabs = self.server.gui.add_tab_group()
+        with tabs.add_tab("Scene", icon=viser.Icon.VIDEO):
+            self.create_scene_gui(
+                camera_distance,
+                camera_azimuth,
+                camera_elevation,
+                show_debug_viz_control,
+                debug_viz_extra_gui,
+            )
+        with tabs.add_tab("Visualization", icon=viser.Icon.EYE):
+            self.create_overlay_gui()
+        self.create_groups_gui(tabs)
+        return tabs
+
+    def create_groups_gui(self, tabs: viser.GuiTabGroupHandle | None = None) -> None:
+        """Add the switches of geom and site groups to the current place, or to a tab of `tabs`."""
+        place = contextlib.nullcontext()
+        if tabs is not None:
+            place = tabs.add_tab("Groups", icon=viser.Icon.LAYERS_INTERSECT)
+        with place:
+            super().create_groups_gui()
 
     def _offset(self, body_xpos: np.ndarray) -> np.ndarray:
         if not self.camera_tracking_enabled or self._tracked_body_id is None:
             return np.zeros(3)
         return -np.asarray(body_xpos[self._tracked_body_id], dtype=float)
 
-    def _forward_selected(self, sim: Any, env_idx: int) -> mujoco.MjData | None:
-        """Contacts, inertia and so on of the selected environment, where any of it is shown."""
-        if not self._any_decor_visible():
-            return None
-        sync_model_fields(self.mj_model, sim.model, sim.expanded_fields, env_idx)
-        sim.copy_to_host(env_idx, self.mj_data)
-        mujoco.mj_forward(self.mj_model, self.mj_data)
-        return self.mj_data
+    def _sync_model_fields(self, env_idx: int) -> None:
+        if self._expanded_fields:
+            sync_model_fields(self.mj_model, self._sim_model, self._expanded_fields, env_idx)
 
-    def _draw_debug(
+    def _update_visualization_locked(
         self,
-        debug_vis: Callable[[ViserDebugVisualizer], None] | None,
+        body_xpos: np.ndarray,
+        body_xmat: np.ndarray,
+        mocap_pos: np.ndarray,
+        mocap_quat: np.ndarray,
         env_idx: int,
-        offset: np.ndarray,
+        scene_offset: np.ndarray,
+        mj_data: mujoco.MjData | None = None,
     ) -> None:
-        self.debug.clear()
-        self.debug.env_idx = env_idx
-        self.debug.show_all_envs = self.show_all_debug and not self.show_only_selected
-        if debug_vis is not None and self.debug_enabled:
-            debug_vis(self.debug)
-        self.debug.send(offset)
+        if not self.debug_visualization_enabled:
+            self.clear()
+        with self.server.atomic():
+            self._variants.update(body_xpos, body_xmat, env_idx, scene_offset)
+            super()._update_visualization_locked(
+                body_xpos, body_xmat, mocap_pos, mocap_quat, env_idx, scene_offset, mj_data
+            )
+            self.send(scene_offset)
 
     def _look_at(self) -> np.ndarray:
         return np.zeros(3) if self.camera_tracking_enabled else np.asarray(self.view.lookat)
@@ -184,12 +279,14 @@ class MjlabViserScene(ViserMujocoScene):
         @select.on_update
         def _(_: Any) -> None:
             self.env_idx = int(select.value)
-            self.request_redraw()
+            if self._last_body_xpos is not None and self.env_idx < len(self._last_body_xpos):
+                self._last_env_idx = self.env_idx
+            self.request_update()
 
         @hide.on_update
         def _(_: Any) -> None:
             self.show_only_selected = hide.value
-            self.request_redraw()
+            self.request_update()
 
     def _create_camera_gui(self) -> None:
         gui = self.server.gui
@@ -214,7 +311,7 @@ class MjlabViserScene(ViserMujocoScene):
             self.camera_tracking_enabled = track.value
             self._aim_initial_camera()
             self.aim()
-            self.request_redraw()
+            self.request_update()
 
         @fov.on_update
         def _(_: Any) -> None:
@@ -225,14 +322,17 @@ class MjlabViserScene(ViserMujocoScene):
         def _(_: Any) -> None:
             self.aim()
 
+    def _create_debug_viz_gui(self) -> None:
+        gui = self.server.gui
+        enabled = gui.add_checkbox("Enabled", self.debug_visualization_enabled)
+        all_envs = gui.add_checkbox("All envs", self.show_all_envs, visible=self.num_envs > 1)
 
-def _whole_model_view(model: mujoco.MjModel) -> CameraView:
-    center = tuple(float(x) for x in model.stat.center)
-    return CameraView(
-        body_id=None,
-        lookat=(center[0], center[1], center[2]),
-        distance=3.0 * float(model.stat.extent),
-        azimuth=120.0,
-        elevation=-20.0,
-        fovy=None,
-    )
+        @enabled.on_update
+        def _(_: Any) -> None:
+            self.debug_visualization_enabled = enabled.value
+            self.request_update()
+
+        @all_envs.on_update
+        def _(_: Any) -> None:
+            self.show_all_envs = all_envs.value
+            self.request_update()

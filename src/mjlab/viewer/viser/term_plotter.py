@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,6 @@ from viser import uplot
 
 from mjlab.viewer.history import TermHistory
 
-PLOT_POINTS = 150
 _SHOWN_AT_FIRST = 6
 _PLOT_HEIGHT = 120
 _COLORS = ("#1c7ed6", "#2f9e44", "#e8590c", "#9c36b5", "#0c8599", "#e03131")
@@ -19,22 +19,68 @@ _COLORS = ("#1c7ed6", "#2f9e44", "#e8590c", "#9c36b5", "#0c8599", "#e03131")
 class ViserTermPlotter:
     """Plots the terms that are ticked; a filter and All / None help with long lists."""
 
-    def __init__(self, server: viser.ViserServer, names: list[str]) -> None:
-        """Add the selection and the plots to the current place in the page."""
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        term_names: list[str],
+        name: str = "Reward",
+        history_length: int = 150,
+        env_idx: int = 0,
+    ) -> None:
+        """Add the selection and the plots to the current place in the page.
+
+        Args:
+            server: The page's server.
+            term_names: Names of the terms.
+            name: Kind of terms, as the panel shows it.
+            history_length: Number of points per plot.
+            env_idx: Environment the values come from, as the panel shows it.
+        """
         self._gui = server.gui
+        self._name = name
+        self.history = TermHistory(history_length)
         self._boxes: dict[str, viser.GuiCheckboxHandle] = {}
         self._plots: dict[str, viser.GuiUplotHandle] = {}
         self._sent: dict[str, np.ndarray] = {}
-        with self._gui.add_folder("Terms", expand_by_default=len(names) > _SHOWN_AT_FIRST):
-            self._add_selection(names)
-        for index, name in enumerate(names):
-            self._plots[name] = self._add_plot(name, _COLORS[index % len(_COLORS)])
+        self._label = self._gui.add_markdown("")
+        expanded = len(term_names) > _SHOWN_AT_FIRST
+        self._folder = self._gui.add_folder("Terms", expand_by_default=expanded)
+        with self._folder:
+            self._add_selection(term_names)
+        for index, term in enumerate(term_names):
+            self._plots[term] = self._add_plot(term, _COLORS[index % len(_COLORS)])
+        self.update_env_idx(env_idx)
 
-    def update(self, history: TermHistory) -> None:
-        """Send the points of `history` to the plots that are shown and have changed."""
+    def update(self, terms: Iterable[tuple[str, Sequence[float]]]) -> None:
+        """Record a point per term, and show it in the plots that are visible."""
+        self.add(terms)
+        self.refresh()
+
+    def add(self, terms: Iterable[tuple[str, Sequence[float]]]) -> None:
+        """Record a point per term; the page changes at the next `refresh`."""
+        self.history.add(terms)
+
+    def refresh(self) -> None:
+        """Send the recorded points to the plots that are visible and have changed."""
         for name, plot in self._plots.items():
             if plot.visible:
-                self._send(name, plot, history.values(name)[-PLOT_POINTS:])
+                self._send(name, plot, self.history.values(name))
+
+    def update_env_idx(self, env_idx: int) -> None:
+        """Say that values come from another environment from now on, and forget the others."""
+        self._label.content = f"<small>{self._name} terms of environment {env_idx}</small>"
+        self.clear_histories()
+
+    def clear_histories(self) -> None:
+        """Forget the recorded points."""
+        self.history.clear()
+
+    def cleanup(self) -> None:
+        """Remove the selection and the plots from the page."""
+        for handle in (self._label, self._folder, *self._plots.values()):
+            handle.remove()
+        self._boxes.clear()
+        self._plots.clear()
 
     def _send(self, name: str, plot: viser.GuiUplotHandle, values: np.ndarray) -> None:
         if np.array_equal(values, self._sent.get(name, np.zeros(0)), equal_nan=True):
@@ -49,21 +95,21 @@ class ViserTermPlotter:
         buttons = self._gui.add_button_group("Select", ["All", "None"])
         for index, name in enumerate(names):
             box = self._gui.add_checkbox(name, index < _SHOWN_AT_FIRST)
-            box.on_update(lambda _: self._refresh(pattern.value))
+            box.on_update(lambda _: self._filter(pattern.value))
             self._boxes[name] = box
 
         @pattern.on_update
         def _(_: Any) -> None:
-            self._refresh(pattern.value)
+            self._filter(pattern.value)
 
         @buttons.on_click
         def _(event: Any) -> None:
             for box in self._boxes.values():
                 if box.visible:
                     box.value = event.target.value == "All"
-            self._refresh(pattern.value)
+            self._filter(pattern.value)
 
-    def _refresh(self, pattern: str) -> None:
+    def _filter(self, pattern: str) -> None:
         for name, box in self._boxes.items():
             box.visible = pattern.lower() in name.lower()
             self._plots[name].visible = box.visible and box.value
@@ -76,7 +122,7 @@ class ViserTermPlotter:
                 uplot.Series(label=name, stroke=color, width=1.5, points={"show": False}),
             ),
             title=name,
-            scales={"x": uplot.Scale(time=False, range=(1 - PLOT_POINTS, 0))},
+            scales={"x": uplot.Scale(time=False, range=(1 - self.history.length, 0))},
             legend=uplot.Legend(show=False),
             height=_PLOT_HEIGHT,
             padding=(8, 24, 0, 0),

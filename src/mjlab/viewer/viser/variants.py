@@ -45,8 +45,11 @@ class GeomVariants:
     have changed, at most once a second: randomisation at resets changes them often.
     """
 
-    def __init__(self, scene: ViserMujocoScene):
+    def __init__(self, scene: ViserMujocoScene, sim_model: Any, expanded_fields: set[str]):
+        """Prepare to draw the per-environment `expanded_fields` of `sim_model`."""
         self._scene = scene
+        self._sim_model = sim_model
+        self._fields = _SHAPE_FIELDS & expanded_fields
         # What mjviser drew. The scene's own model is overwritten with the selected environment's.
         self._base = copy.copy(scene.mj_model)
         self._shapes: dict[Any, _Shape] = {}
@@ -55,29 +58,29 @@ class GeomVariants:
         self._next_check = 0.0
 
     def update(
-        self, sim: Any, body_xpos: np.ndarray, body_xmat: np.ndarray, offset: np.ndarray
+        self, body_xpos: np.ndarray, body_xmat: np.ndarray, env_idx: int, offset: np.ndarray
     ) -> None:
-        """Move the shapes to (num_envs, nbody, ...) poses; make them anew where they changed."""
+        """Move the shapes to (num_envs, nbody, ...) poses; make them again if they changed."""
         now = time.perf_counter()
         if now >= self._next_check:
             self._next_check = now + _CHECK_PERIOD_S
-            self._rebuild_if_changed(sim)
+            self._rebuild_if_changed()
         if not self._shapes:
             return
         quats = vtf.SO3.from_matrix(body_xmat).wxyz
         for shape in self._shapes.values():
             envs, bodies = np.array(shape.envs), np.array(shape.bodies)
+            chosen = envs < len(body_xpos)
             if self._scene.show_only_selected:
-                chosen = envs == self._scene.env_idx
-                envs, bodies = envs[chosen], bodies[chosen]
+                chosen = envs == env_idx
+            envs, bodies = envs[chosen], bodies[chosen]
             shape.handle.visible = self._scene.geom_groups_visible[shape.group] and len(envs) > 0
             if shape.handle.visible:
                 shape.handle.batched_positions = body_xpos[envs, bodies] + offset
                 shape.handle.batched_wxyzs = quats[envs, bodies]
 
-    def _rebuild_if_changed(self, sim: Any) -> None:
-        fields = sorted(_SHAPE_FIELDS & set(sim.expanded_fields))
-        values = {name: to_numpy(getattr(sim.model, name)) for name in fields}
+    def _rebuild_if_changed(self) -> None:
+        values = {name: to_numpy(getattr(self._sim_model, name)) for name in sorted(self._fields)}
         if values.keys() == self._seen.keys() and all(
             np.array_equal(value, self._seen[name]) for name, value in values.items()
         ):
@@ -88,7 +91,7 @@ class GeomVariants:
         self._shapes = {}
         self._take_over(_varying_geoms(self._base, values))
         if self._taken_over:
-            self._build(sim, set(fields))
+            self._build()
 
     def _take_over(self, varying: np.ndarray) -> None:
         """Remove mjviser's batches of bodies with a varying geom; they are drawn here from now."""
@@ -102,11 +105,11 @@ class GeomVariants:
                 groups[:] = [other for other in groups if other is not batch]
                 self._taken_over |= {(int(body), batch.group_id) for body in batch.body_ids}
 
-    def _build(self, sim: Any, fields: set[str]) -> None:
+    def _build(self) -> None:
         model = copy.copy(self._base)
         borrowed = False
         for env_idx in range(self._scene.num_envs):
-            sync_model_fields(model, sim.model, fields, env_idx)
+            sync_model_fields(model, self._sim_model, self._fields, env_idx)
             for body, group in sorted(self._taken_over):
                 for part, geom_ids in enumerate(_drawn_geoms(model, body, group)):
                     look = self._scene._geom_subgroup_fingerprint(model, geom_ids, False)

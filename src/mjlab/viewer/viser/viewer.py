@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import logging
 import time
 from typing import TYPE_CHECKING, Any
@@ -9,21 +10,22 @@ from typing import TYPE_CHECKING, Any
 import torch
 import viser
 
-from mjlab.sensor import CameraSensor
 from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction
 from mjlab.viewer.camera import resolve_camera
-from mjlab.viewer.history import TermHistory
-from mjlab.viewer.model_sync import host_model
-from mjlab.viewer.viser.camera_feeds import CameraFeeds
+from mjlab.viewer.viser.checkpoints import CheckpointManager as CheckpointManager
 from mjlab.viewer.viser.checkpoints import CheckpointPanel
+from mjlab.viewer.viser.checkpoints import format_time_ago as format_time_ago
 from mjlab.viewer.viser.controls import SimulationControls
-from mjlab.viewer.viser.reward_bars import RewardBarPanel
+from mjlab.viewer.viser.overlays import (
+    ViserCameraOverlays,
+    ViserContactOverlays,
+    ViserDebugOverlays,
+    ViserTermOverlays,
+)
 from mjlab.viewer.viser.scene import MjlabViserScene
-from mjlab.viewer.viser.term_plotter import PLOT_POINTS, ViserTermPlotter
 
 if TYPE_CHECKING:
     from mjlab.viewer.base import EnvProtocol, PolicyProtocol
-    from mjlab.viewer.viser.checkpoints import CheckpointSource
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +34,17 @@ DEFAULT_PORT = 8080
 
 _PANEL_PERIOD_S = 0.2
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
+
+
+class UpdateReason(enum.Enum):
+    """Reason why the scene must be drawn again."""
+
+    ACTION = enum.auto()
+    """The environment was stepped or reset."""
+    ENV_SWITCH = enum.auto()
+    """Another environment is in view."""
+    SCENE_REQUEST = enum.auto()
+    """A control of the page was changed."""
 
 
 class ViserPlayViewer(BaseViewer):
@@ -51,7 +64,7 @@ class ViserPlayViewer(BaseViewer):
         frame_rate: float = 60.0,
         verbosity: int = VerbosityLevel.SILENT,
         viser_server: viser.ViserServer | None = None,
-        checkpoints: CheckpointSource | None = None,
+        checkpoint_manager: CheckpointManager | None = None,
         host: str = DEFAULT_HOST,
         port: int = DEFAULT_PORT,
     ) -> None:
@@ -63,7 +76,7 @@ class ViserPlayViewer(BaseViewer):
             frame_rate: Display updates per second of wall time.
             verbosity: How much to log, a `VerbosityLevel`.
             viser_server: A server to use instead of starting one at `host` and `port`.
-            checkpoints: Where other checkpoints can be chosen from, if anywhere.
+            checkpoint_manager: Checkpoints to choose from. None: no such tab.
             host: Address to serve on; `0.0.0.0` serves the whole network.
             port: Port to serve on; the next free one where it is taken.
         """
@@ -74,19 +87,19 @@ class ViserPlayViewer(BaseViewer):
                 host,
             )
         self._server = viser_server or viser.ViserServer(host=host, port=port, verbose=False)
-        self._checkpoints = checkpoints
+        self._checkpoint_manager = checkpoint_manager
         self._closed = False
-        self._rewards = TermHistory(PLOT_POINTS)
-        self._metrics = TermHistory(PLOT_POINTS)
-        self._history_env: int | None = None
         self._scene: MjlabViserScene | None = None
         self._controls: SimulationControls | None = None
-        self._camera_feeds: CameraFeeds | None = None
-        self._reward_bars: RewardBarPanel | None = None
-        self._plots: list[tuple[ViserTermPlotter, TermHistory]] = []
+        self._term_overlays: ViserTermOverlays | None = None
+        self._camera_overlays: ViserCameraOverlays | None = None
+        self._debug_overlays: ViserDebugOverlays | None = None
+        self._contact_overlays: ViserContactOverlays | None = None
         self._checkpoint_panel: CheckpointPanel | None = None
+        self._shown_env = 0
         self._next_scene = self._next_panels = 0.0
-        self._dirty = True
+        # Only ever changed in place: threads of the server add to it.
+        self._update_reasons = {UpdateReason.ACTION}
 
     @property
     def server(self) -> viser.ViserServer:
@@ -115,16 +128,27 @@ class ViserPlayViewer(BaseViewer):
 
     def setup(self) -> None:
         env, cfg = self.env.unwrapped, self.cfg
-        model = host_model(env.sim.mj_model)
-        self._scene = MjlabViserScene(
+        model = env.sim.mj_model
+        scene = self._scene = MjlabViserScene(
             self._server,
             model,
             env.num_envs,
+            env.sim.model,
+            env.sim.expanded_fields,
             view=resolve_camera(cfg, model, env.scene.entities),
             geom_group=cfg.geom_group,
             site_group=cfg.site_group,
         )
-        self._scene.env_idx = min(max(cfg.env_idx, 0), env.num_envs - 1)
+        scene.set_refresh_handler(lambda: self._update_reasons.add(UpdateReason.SCENE_REQUEST))
+        scene.env_idx = self._shown_env = min(max(cfg.env_idx, 0), env.num_envs - 1)
+        self._term_overlays = ViserTermOverlays(
+            self._server, env, scene, float(env.step_dt), cfg.reward_bar_max_terms
+        )
+        self._camera_overlays = ViserCameraOverlays(
+            self._server, env, model, request_redraw=scene.request_update
+        )
+        self._debug_overlays = ViserDebugOverlays(env, scene)
+        self._contact_overlays = ViserContactOverlays(scene)
         self._bind_drawn_fields()
         self._create_gui()
         log.debug("The viewer is at %s", self.url)
@@ -146,29 +170,28 @@ class ViserPlayViewer(BaseViewer):
 
     def sync_env_to_viewer(self) -> None:
         now = time.perf_counter()
-        changed = self._dirty or self.scene.redraw_requested
-        if changed and now >= self._next_scene:
+        self._follow_env_switch()
+        if self._update_reasons and now >= self._next_scene:
             self._next_scene = now + self.scene_period
-            self._dirty = False
-            self._forget_history_of_other_env()
-            sim = self.env.unwrapped.sim
-            self.scene.draw(sim, self.env.unwrapped.update_visualizers)
-            if self._camera_feeds is not None:
-                self._camera_feeds.show(sim, self.scene.env_idx, self.scene.offset)
-        if now >= self._next_panels:
+            # Requests from here on may come too late for this drawing, and cause another.
+            self._update_reasons.clear()
+            self._draw_scene()
+        if self._term_overlays is not None:
+            self._term_overlays.update(paused=True)
+        if self._controls is not None and now >= self._next_panels:
             self._next_panels = now + _PANEL_PERIOD_S
-            self._update_panels()
+            self._controls.show_status(self.get_status())
 
     def after_env_step(self) -> None:
-        self._dirty = True
-        self._forget_history_of_other_env()
-        env, env_idx = self.env.unwrapped, self.scene.env_idx
-        self._rewards.add(env.reward_manager.get_active_iterable_terms(env_idx))
-        self._metrics.add(env.metrics_manager.get_active_iterable_terms(env_idx))
+        self._update_reasons.add(UpdateReason.ACTION)
+        self._follow_env_switch()
+        if self._term_overlays is not None:
+            self._term_overlays.update(paused=False)
 
     def after_reset(self) -> None:
-        self._dirty = True
-        self._clear_history()
+        self._update_reasons.add(UpdateReason.ACTION)
+        if self._term_overlays is not None:
+            self._term_overlays.clear_histories()
 
     def on_paused(self, paused: bool) -> None:
         self.env.unwrapped.command_manager.on_viewer_pause(paused)
@@ -194,7 +217,7 @@ class ViserPlayViewer(BaseViewer):
         sim.forward()
 
     def _create_gui(self) -> None:
-        env, gui, scene = self.env.unwrapped, self._server.gui, self.scene
+        gui, scene = self._server.gui, self.scene
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Controls", icon=viser.Icon.SETTINGS):
@@ -202,43 +225,21 @@ class ViserPlayViewer(BaseViewer):
             self._controls = SimulationControls(self._server, self.request_action)
             self._add_command_panels()
             with gui.add_folder("Scene"):
-                scene.create_scene_gui()
-                self._add_debug_vis_panel()
-            self._add_camera_feeds()
+                scene.create_scene_gui(debug_viz_extra_gui=self._add_debug_vis_switches)
+            if self._camera_overlays is not None:
+                self._camera_overlays.setup_controls()
         with tabs.add_tab("Visualization", icon=viser.Icon.EYE):
             scene.create_overlay_gui()
-        with tabs.add_tab("Rewards", icon=viser.Icon.CHART_BAR):
-            names = list(env.reward_manager.active_terms)
-            self._reward_bars = RewardBarPanel(self._server, names, self.cfg.reward_bar_max_terms)
-            self._plots.append((ViserTermPlotter(self._server, names), self._rewards))
-        metrics = list(env.metrics_manager.active_terms) if self._has_metrics() else []
-        if metrics:
-            with tabs.add_tab("Metrics", icon=viser.Icon.CHART_LINE):
-                self._plots.append((ViserTermPlotter(self._server, metrics), self._metrics))
-        with tabs.add_tab("Groups", icon=viser.Icon.LAYERS_INTERSECT):
-            scene.create_groups_gui()
-        if self._checkpoints is not None:
+        if self._term_overlays is not None:
+            self._term_overlays.setup_tabs(tabs)
+        scene.create_groups_gui(tabs)
+        if self._checkpoint_manager is not None:
             with tabs.add_tab("Checkpoints", icon=viser.Icon.FOLDER):
                 self._checkpoint_panel = CheckpointPanel(
                     self._server,
-                    self._checkpoints,
+                    self._checkpoint_manager,
                     lambda name: self.request_action("fetch_checkpoint", name),
                 )
-
-    def _add_camera_feeds(self) -> None:
-        env = self.env.unwrapped
-        cameras = {
-            name: sensor
-            for name, sensor in getattr(env.scene, "sensors", {}).items()
-            if isinstance(sensor, CameraSensor)
-        }
-        if cameras:
-            self._camera_feeds = CameraFeeds(
-                self._server, cameras, env.sim.mj_model, self.scene.request_redraw
-            )
-
-    def _has_metrics(self) -> bool:
-        return bool(getattr(self.env.unwrapped.metrics_manager, "active_terms", ()))
 
     def _add_command_panels(self) -> None:
         commands = self.env.unwrapped.command_manager
@@ -248,54 +249,43 @@ class ViserPlayViewer(BaseViewer):
             commands.create_gui(
                 self._server,
                 lambda: self.scene.env_idx,
-                self.scene.request_redraw,
+                self.scene.request_update,
                 self.request_action,
             )
         if not folder._children:
             folder.remove()
 
-    def _add_debug_vis_panel(self) -> None:
-        env, gui, scene = self.env.unwrapped, self._server.gui, self.scene
-        with gui.add_folder("Debug Viz"):
-            enabled = gui.add_checkbox("Enabled", scene.debug_enabled)
-            all_envs = gui.add_checkbox("All envs", scene.show_all_debug, visible=env.num_envs > 1)
-            for part in (*env.manager_visualizers.values(), env.sensor_visualizers):
-                part.create_debug_vis_gui(self._server, scene.request_redraw)
+    def _add_debug_vis_switches(self) -> None:
+        env = self.env.unwrapped
+        for part in (*env.manager_visualizers.values(), env.sensor_visualizers):
+            part.create_debug_vis_gui(self._server, self.scene.request_update)
 
-        @enabled.on_update
-        def _(_: Any) -> None:
-            scene.debug_enabled = enabled.value
-            scene.request_redraw()
+    def _draw_scene(self) -> None:
+        env, scene = self.env.unwrapped, self.scene
+        if self._debug_overlays is not None:
+            self._debug_overlays.queue()
+        scene.update(env.sim, self._shown_env)
+        if self._camera_overlays is not None and self._camera_overlays.has_cameras:
+            self._camera_overlays.update(env.sim.data, self._shown_env, scene.offset)
 
-        @all_envs.on_update
-        def _(_: Any) -> None:
-            scene.show_all_debug = all_envs.value
-            scene.request_redraw()
-
-    def _update_panels(self) -> None:
-        if self._controls is not None:
-            self._controls.show_status(self.get_status())
-        if self._reward_bars is not None:
-            self._reward_bars.update(self._rewards)
-        for plotter, history in self._plots:
-            plotter.update(history)
-
-    def _forget_history_of_other_env(self) -> None:
-        if self._history_env != self.scene.env_idx:
-            self._history_env = self.scene.env_idx
-            self._clear_history()
-
-    def _clear_history(self) -> None:
-        self._rewards.clear()
-        self._metrics.clear()
+    def _follow_env_switch(self) -> None:
+        """Start plots and drawings over if the page selected another environment."""
+        env_idx = self.scene.env_idx
+        if self._shown_env == env_idx:
+            return
+        self._shown_env = env_idx
+        for overlays in (self._term_overlays, self._debug_overlays, self._contact_overlays):
+            if overlays is not None:
+                overlays.on_env_switch()
+        self._update_reasons.add(UpdateReason.ENV_SWITCH)
 
     def _load_checkpoint(self, name: str) -> None:
         """Play on with another policy; one that cannot be loaded leaves the present one alone."""
         panel = self._checkpoint_panel
-        if self._checkpoints is None or panel is None:
+        if self._checkpoint_manager is None or panel is None:
             return
         try:
-            policy = self._checkpoints.load(name)
+            policy = self._checkpoint_manager.load_checkpoint(name)
         except Exception as error:
             log.exception("Cannot load the checkpoint %s.", name)
             panel.show_error(f"Cannot load {name}: {error}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import logging
+from collections.abc import Iterable, Sequence
 
 import viser
 
@@ -11,49 +12,72 @@ from mjlab.viewer.history import TermHistory
 
 log = logging.getLogger(__name__)
 
-_WINDOW_STEPS = 60
+_WINDOW_S = 1.0
 _POSITIVE, _NEGATIVE = "#2f9e44", "#e03131"
 
 
 class RewardBarPanel:
-    """One bar a reward term: its mean over the last 60 environment steps.
+    """One bar per reward term: its mean over the last second.
 
     The longest bar is the largest magnitude; green adds to the reward, red takes from it.
     """
 
-    def __init__(self, server: viser.ViserServer, names: list[str], max_terms: int = 20) -> None:
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        term_names: list[str],
+        update_dt: float,
+        max_terms: int = 20,
+    ) -> None:
         """Add the panel to the current place in the page.
 
         Args:
             server: The page's server.
-            names: The reward terms.
-            max_terms: Terms shown; the rest are left out, which is logged.
+            term_names: Names of the reward terms.
+            update_dt: Time between two calls of `update` (s).
+            max_terms: Number of terms shown; the rest is left out, with a warning.
         """
-        if len(names) > max_terms:
+        if len(term_names) > max_terms:
             log.warning(
                 "The reward has %d terms; bars show the first %d. Raise "
                 "viewer.reward_bar_max_terms to see more.",
-                len(names),
+                len(term_names),
                 max_terms,
             )
-        self._names = names[:max_terms]
+        self._names = term_names[:max_terms]
+        self._history = TermHistory(max(1, round(_WINDOW_S / update_dt)))
         self._html = server.gui.add_html("")
         self._shown = ""
-        self._show(dict.fromkeys(self._names, 0.0))
+        self.refresh()
 
-    def update(self, history: TermHistory) -> None:
-        """Show the means of `history`."""
-        self._show({name: history.mean(name, _WINDOW_STEPS) for name in self._names})
+    def update(self, terms: Iterable[tuple[str, Sequence[float]]]) -> None:
+        """Record a value per term, and show the means."""
+        self.add(terms)
+        self.refresh()
 
-    def _show(self, means: dict[str, float]) -> None:
+    def add(self, terms: Iterable[tuple[str, Sequence[float]]]) -> None:
+        """Record a value per term; the page changes at the next `refresh`."""
+        self._history.add(terms)
+
+    def refresh(self) -> None:
+        """Show the means of the recorded values."""
+        means = {name: self._history.mean(name) for name in self._names}
         largest = max((abs(value) for value in means.values()), default=0.0) or 1.0
         rows = "".join(_row(name, value, largest) for name, value in means.items())
         content = (
             '<div style="padding:0.25em 1em;font-size:0.8em">'
-            f"<div><strong>Mean of the last {_WINDOW_STEPS} steps</strong></div>{rows}</div>"
+            f"<div><strong>Mean of the last {self._history.length} steps</strong></div>{rows}</div>"
         )
         if content != self._shown:
             self._shown = self._html.content = content
+
+    def clear_histories(self) -> None:
+        """Forget the recorded values."""
+        self._history.clear()
+
+    def cleanup(self) -> None:
+        """Remove the panel from the page."""
+        self._html.remove()
 
 
 def _row(name: str, value: float, largest: float) -> str:

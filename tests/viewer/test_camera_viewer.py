@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from mjlab.sensor import CameraSensorCfg
-from mjlab.viewer.viser.camera_feeds import (
-    CameraFeeds,
+from mjlab.viewer.viser.camera_viewer import (
+    ViserCameraViewer,
     depth_colors,
     enlarged,
     segmentation_colors,
     vertical_angle,
 )
+from mjlab.viewer.viser.overlays import ViserCameraOverlays
 
 from ..sensor.camera_scenes import BALL, scene_with, sense  # noqa: TID252
 
@@ -25,10 +27,13 @@ ALL = ("rgb", "depth", "segmentation")
 def feeds_of(server, *sensors: CameraSensorCfg, num_envs: int = 2):
     sim, scene = scene_with(*sensors, num_envs=num_envs, ball=BALL)
     sense(sim)
-    cameras = {sensor.name: scene[sensor.name] for sensor in sensors}
+    env = SimpleNamespace(sim=sim, scene=scene)
     redraws = []
-    feeds = CameraFeeds(server, cameras, sim.mj_model, lambda: redraws.append(1))
-    return sim, scene, feeds, redraws
+    overlays = ViserCameraOverlays(
+        server, env, sim.mj_model, request_redraw=lambda: redraws.append(1)
+    )
+    overlays.setup_controls()
+    return sim, scene, overlays, redraws
 
 
 def eye(name: str = "eye", camera: str = "room/down", **changes) -> CameraSensorCfg:
@@ -42,10 +47,10 @@ def test_the_images_are_those_of_the_selected_environment(viser_server) -> None:
     pose = torch.tensor([[0.0, 0.0, 0.5, 1, 0, 0, 0], [0.0, 0.0, 2.9, 1, 0, 0, 0]])
     scene["ball"].write_root_link_pose_to_sim(pose)
     sense(sim)
-    handles = feeds._feeds[0]._images
+    handles = feeds.camera_viewers[0]._images
     shown = []
     for env in (0, 1):
-        feeds.show(sim, env, np.zeros(3))
+        feeds.update(sim.data, env, np.zeros(3))
         assert handles["rgb"].image.shape == (22 * 6, 22 * 8, 3)
         rgb = scene["eye"].data.rgb[env].numpy()
         np.testing.assert_array_equal(handles["rgb"].image[::22, ::22], rgb)
@@ -56,13 +61,13 @@ def test_the_images_are_those_of_the_selected_environment(viser_server) -> None:
 
 def test_the_slider_says_at_how_many_metres_depth_is_white(viser_server) -> None:
     sim, _, feeds, redraws = feeds_of(viser_server, eye(data_types=("depth",)))
-    feed = feeds._feeds[0]
+    feed = feeds.camera_viewers[0]
     assert set(feed._images) == {"depth"}
     assert (feed._range.value, feed._range.min, feed._range.max) == (1.0, 0.1, 10.0)
-    feeds.show(sim, 0, np.zeros(3))
+    feeds.update(sim.data, 0, np.zeros(3))
     assert feed._images["depth"].image.min() == 255, "everything is farther away than 1 m"
     feed._range.value = 6.0
-    feeds.show(sim, 0, np.zeros(3))
+    feeds.update(sim.data, 0, np.zeros(3))
     # The floor is 3 m away.
     assert feed._images["depth"].image[0, 0].tolist() == [127, 127, 127]
     assert redraws
@@ -70,8 +75,8 @@ def test_the_slider_says_at_how_many_metres_depth_is_white(viser_server) -> None
 
 def test_the_frustum_stands_where_the_camera_is_and_can_be_hidden(viser_server) -> None:
     sim, _, feeds, _ = feeds_of(viser_server, eye(), eye("map", "room/map"))
-    feed, other = feeds._feeds
-    feeds.show(sim, 0, np.array([1.0, 0.0, 0.0]))
+    feed, other = feeds.camera_viewers
+    feeds.update(sim.data, 0, np.array([1.0, 0.0, 0.0]))
     frustum = feed._frustum
     np.testing.assert_allclose(frustum.position, [1.0, 0.0, 3.0])
     # It looks along its z axis, and the camera looks down.
@@ -81,7 +86,7 @@ def test_the_frustum_stands_where_the_camera_is_and_can_be_hidden(viser_server) 
     assert frustum.fov == pytest.approx(math.radians(90.0))
     assert frustum.aspect == pytest.approx(8 / 6)
     feed._shows_frustum.value = False
-    feeds.show(sim, 0, np.zeros(3))
+    feeds.update(sim.data, 0, np.zeros(3))
     assert not frustum.visible
     assert other._frustum is None, "parallel rays have no frustum"
 
@@ -118,3 +123,15 @@ def test_objects_have_colours_of_their_own_and_the_background_is_black() -> None
     # Neighbouring ids are told apart by eye.
     step = np.abs(colors[2:].astype(int) - colors[1:-1].astype(int)).max(axis=1)
     assert np.median(step) > 40
+
+
+def test_a_viewer_of_one_camera_is_made_and_removed_by_itself(viser_server) -> None:
+    sim, scene, feeds, _ = feeds_of(viser_server, eye())
+    feeds.cleanup()
+    viewer = ViserCameraViewer(viser_server, scene["eye"], sim.mj_model, min_display_size=30)
+    viewer.update(sim.data)
+    assert viewer._images["rgb"].image.shape == (5 * 6, 5 * 8, 3)
+    np.testing.assert_allclose(viewer._frustum.position, [0.0, 0.0, 3.0])
+    viewer.cleanup()
+    assert not viser_server.gui._container_handle_from_uuid["root"]._children
+    assert "/cameras/eye" not in viser_server.scene._handle_from_node_name

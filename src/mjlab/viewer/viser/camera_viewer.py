@@ -1,9 +1,9 @@
-"""What the camera sensors of the selected environment see, beside the scene and within it."""
+"""Images and frustum of a camera sensor in the browser."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -14,8 +14,8 @@ import viser.transforms as vtf
 from mjlab.sensor import CameraSensor
 from mjlab.viewer.model_sync import to_numpy
 
-# Images are enlarged to this many pixels, unless they became wider than the panel then.
-_WANTED_PIXELS, _PANEL_PIXELS = 128, 384
+# Enlarged images are not wider than the panel.
+_PANEL_PIXELS = 384
 # Metres shown white: least, most, step and first value of the slider.
 _RANGE, _STEP, _FIRST_RANGE = (0.1, 10.0), 0.1, 1.0
 _FRUSTUM_LENGTH = 0.08
@@ -24,54 +24,39 @@ _FRUSTUM_COLOR = (250, 176, 5)
 _TO_FRUSTUM = vtf.SO3(np.array([0.0, 1.0, 0.0, 0.0]))
 
 
-class CameraFeeds:
-    """Shows the images of camera sensors in a folder of the page, and their frustums in the scene."""
+class ViserCameraViewer:
+    """Images of one camera sensor in a folder of the page, and its frustum in the scene."""
 
     def __init__(
         self,
         server: viser.ViserServer,
-        sensors: Mapping[str, CameraSensor],
-        model: mujoco.MjModel,
-        request_redraw: Callable[[], None],
+        camera_sensor: CameraSensor,
+        mj_model: mujoco.MjModel,
+        min_display_size: int = 128,
+        *,
+        sim_model: Any | None = None,
+        request_redraw: Callable[[], None] | None = None,
     ) -> None:
-        """Add a folder for each sensor to the current place in the page.
+        """Add the folder to the current place in the page.
 
         Args:
             server: The page's server.
-            sensors: Initialized camera sensors by name.
-            model: The compiled model.
-            request_redraw: Is called when a control was changed.
+            camera_sensor: Initialized camera sensor.
+            mj_model: The compiled model.
+            min_display_size: Size in pixels that images are enlarged to, if the panel has room.
+            sim_model: Batched model, for fields of view that differ per environment.
+            request_redraw: Called when a control was changed.
         """
-        with server.gui.add_folder("Camera Feeds"):
-            self._feeds = [
-                _Feed(server, name, sensor, model, request_redraw)
-                for name, sensor in sensors.items()
-            ]
-
-    def show(self, sim: Any, env_idx: int, offset: np.ndarray) -> None:
-        """Show the latest images of an environment, whose scene is moved by `offset` (3,)."""
-        for feed in self._feeds:
-            feed.show(sim, env_idx, offset)
-
-
-class _Feed:
-    """One sensor's images and frustum."""
-
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        name: str,
-        sensor: CameraSensor,
-        model: mujoco.MjModel,
-        request_redraw: Callable[[], None],
-    ) -> None:
-        self._server, self._name, self._sensor, self._model = server, name, sensor, model
+        self._server, self._sensor = server, camera_sensor
+        self._model, self._sim_model = mj_model, sim_model
+        self._min_size = min_display_size
         self._images: dict[str, viser.GuiImageHandle] = {}
         self._range: viser.GuiInputHandle[float] | None = None
         self._frustum: viser.CameraFrustumHandle | None = None
-        gui, view = server.gui, sensor.view
-        blank = enlarged(np.zeros((view.height, view.width, 3), np.uint8))
-        with gui.add_folder(name):
+        gui, view = server.gui, camera_sensor.view
+        blank = enlarged(np.zeros((view.height, view.width, 3), np.uint8), min_display_size)
+        self._folder = gui.add_folder(camera_sensor.cfg.name)
+        with self._folder:
             for kind in view.data_types:
                 self._images[kind] = gui.add_image(blank, label=kind.capitalize(), format="png")
                 if kind == "depth":
@@ -83,13 +68,24 @@ class _Feed:
                         initial_value=_FIRST_RANGE,
                         hint="What is so far away or farther, or not there, is white.",
                     )
-                    self._range.on_update(lambda _: request_redraw())
             self._shows_frustum = gui.add_checkbox(
                 "Frustum", True, hint="Show in the scene what the camera looks at."
             )
-            self._shows_frustum.on_update(lambda _: request_redraw())
+        if request_redraw is not None:
+            for control in (self._range, self._shows_frustum):
+                if control is not None:
+                    control.on_update(lambda _: request_redraw())
 
-    def show(self, sim: Any, env_idx: int, offset: np.ndarray) -> None:
+    def update(
+        self, sim_data: Any, env_idx: int = 0, scene_offset: np.ndarray | None = None
+    ) -> None:
+        """Show the latest images of an environment.
+
+        Args:
+            sim_data: Batched data of the simulation.
+            env_idx: The environment.
+            scene_offset: Translation of the drawn scene, (3,); None: not moved.
+        """
         data = self._sensor.data
         for kind, handle in self._images.items():
             image = to_numpy(getattr(data, kind)[env_idx])
@@ -98,10 +94,18 @@ class _Feed:
                 image = depth_colors(image, float(self._range.value))
             elif kind == "segmentation":
                 image = segmentation_colors(image)
-            handle.image = enlarged(image)
-        self._show_frustum(sim, env_idx, offset)
+            handle.image = enlarged(image, self._min_size)
+        offset = np.zeros(3) if scene_offset is None else scene_offset
+        self._show_frustum(sim_data, env_idx, offset)
 
-    def _show_frustum(self, sim: Any, env_idx: int, offset: np.ndarray) -> None:
+    def cleanup(self) -> None:
+        """Remove the images and the frustum from the page."""
+        self._folder.remove()
+        if self._frustum is not None:
+            self._frustum.remove()
+            self._frustum = None
+
+    def _show_frustum(self, data: Any, env_idx: int, offset: np.ndarray) -> None:
         camera, view = self._sensor.camera_idx, self._sensor.view
         is_orthographic = self._model.cam_projection[camera] != 0
         if is_orthographic or not self._shows_frustum.value:
@@ -109,15 +113,19 @@ class _Feed:
                 self._frustum.visible = False
             return
         aspect = view.width / view.height
-        fovy = float(sim.model.cam_fovy[env_idx, camera])
-        intrinsic = to_numpy(sim.model.cam_intrinsic[env_idx, camera])
-        angle = vertical_angle(fovy, self._model.cam_sensorsize[camera], intrinsic[1], aspect)
-        mat = to_numpy(sim.data.cam_xmat[env_idx, camera]).astype(float)
+        fovy, intrinsic = self._model.cam_fovy[camera], self._model.cam_intrinsic[camera]
+        if self._sim_model is not None:
+            fovy = self._sim_model.cam_fovy[env_idx, camera]
+            intrinsic = to_numpy(self._sim_model.cam_intrinsic[env_idx, camera])
+        angle = vertical_angle(
+            float(fovy), self._model.cam_sensorsize[camera], intrinsic[1], aspect
+        )
+        mat = to_numpy(data.cam_xmat[env_idx, camera]).astype(float)
         wxyz = (vtf.SO3.from_matrix(mat) @ _TO_FRUSTUM).wxyz
-        position = to_numpy(sim.data.cam_xpos[env_idx, camera]) + offset
+        position = to_numpy(data.cam_xpos[env_idx, camera]) + offset
         if self._frustum is None:
             self._frustum = self._server.scene.add_camera_frustum(
-                f"/cameras/{self._name}",
+                f"/cameras/{self._sensor.cfg.name}",
                 fov=angle,
                 aspect=aspect,
                 scale=_FRUSTUM_LENGTH,
@@ -146,10 +154,10 @@ def vertical_angle(fovy: float, sensorsize: np.ndarray, focal: float, aspect: fl
     return 2.0 * math.atan(min(height, width / aspect) / 2.0 / float(focal))
 
 
-def enlarged(image: np.ndarray) -> np.ndarray:
-    """Enlarge an image (H, W, 3) by a whole factor, to 128 pixels or what fits into the panel."""
+def enlarged(image: np.ndarray, min_size: int = 128) -> np.ndarray:
+    """Enlarge an image (H, W, 3) by a whole factor, to `min_size` pixels or the panel's size."""
     height, width = image.shape[:2]
-    factor = -(-_WANTED_PIXELS // min(height, width))
+    factor = -(-min_size // min(height, width))
     factor = max(1, min(factor, _PANEL_PIXELS // max(height, width)))
     return image.repeat(factor, axis=0).repeat(factor, axis=1)
 
