@@ -52,7 +52,7 @@ class ViserTermOverlays:
         if metrics:
             with tabs.add_tab("Metrics", icon=viser.Icon.CHART_LINE):
                 self.metrics_plotter = ViserTermPlotter(
-                    self.server, metrics, "Metrics", env_idx=env_idx
+                    self.server, metrics, "Metric", env_idx=env_idx
                 )
 
     def update(self, paused: bool) -> None:
