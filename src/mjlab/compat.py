@@ -65,11 +65,11 @@ _VISER = {
         "is_fixed_body",
         "merge_geoms",
         "merge_sites",
+        "mujoco_mesh_to_trimesh",
         "rotation_matrix_from_vectors",
     )
 }
 _VISER["rotation_quat_from_vectors"] = "mjlab.compat:rotation_quat_from_vectors"
-_VISER["mujoco_mesh_to_trimesh"] = "mjlab.viewer.viser.conversions:mujoco_mesh_to_trimesh"
 
 _NAMES: dict[str, dict[str, str]] = {
     "mjlab.actuator": {**_XML_ACTUATORS, **_DELAYED_ACTUATORS},
@@ -93,7 +93,10 @@ _NAMES: dict[str, dict[str, str]] = {
     "mjlab.utils.os": {"update_assets": "mjlab.compat:update_assets"},
     "mjlab.utils.spec": {"disable_collision": "mjlab.compat:disable_collision"},
     "mjlab.viewer.base": {"Timer": "mjlab.compat:Timer"},
-    "mjlab.viewer.viser": _VISER,
+    "mjlab.viewer.viser": {
+        **_VISER,
+        "mujoco_mesh_to_trimesh": "mjlab.viewer.viser.conversions:mujoco_mesh_to_trimesh",
+    },
     "mjlab.viewer.viser.conversions": _VISER,
 }
 
@@ -193,6 +196,23 @@ def older_exports(module_name: str) -> list[str]:
     return [name for name in _NAMES[module_name] if name[0].islower()]
 
 
+def accepts_older_methods(cls: C) -> C:
+    """Class decorator: offer the static methods that were dropped from a class."""
+    for name, path in _STATIC_METHODS[cls.__name__].items():
+        setattr(cls, name, staticmethod(_calling(f"{cls.__name__}.{name}", path)))
+    return cls
+
+
+def _calling(older_name: str, path: str) -> Callable[..., Any]:
+    home, _, today = path.partition(":")
+
+    def older(*args: Any, **kwargs: Any) -> Any:
+        _warn_once(f"{older_name} is an older name; today it is {home}.{today}.")
+        return getattr(importlib.import_module(home), today)(*args, **kwargs)
+
+    return older
+
+
 def _warning_when_called(function: Callable[..., Any], message: str) -> Callable[..., Any]:
     # `wraps` also carries over what the function declares: the model fields it randomizes.
     @functools.wraps(function)
@@ -227,23 +247,6 @@ def accepts_older_fields(config_class: C) -> C:
 
     cls.__init__ = __init__
     return config_class
-
-
-def accepts_older_methods(cls: C) -> C:
-    """Class decorator: offer the static methods that were dropped from a class."""
-    for name, path in _STATIC_METHODS[cls.__name__].items():
-        setattr(cls, name, staticmethod(_calling(f"{cls.__name__}.{name}", path)))
-    return cls
-
-
-def _calling(older_name: str, path: str) -> Callable[..., Any]:
-    home, _, today = path.partition(":")
-
-    def older(*args: Any, **kwargs: Any) -> Any:
-        _warn_once(f"{older_name} is an older name; today it is {home}.{today}.")
-        return getattr(importlib.import_module(home), today)(*args, **kwargs)
-
-    return older
 
 
 # Small things that have no successor, as they were.
