@@ -8,6 +8,7 @@ import warnings
 import pytest
 
 from mjlab import compat
+from mjlab.compat import older
 from mjlab.managers import EventTermCfg
 from mjlab.rl import RslRlModelCfg
 from mjlab.utils.spec_config import CollisionCfg
@@ -108,7 +109,7 @@ def test_todays_spelling_does_not_warn():
 def test_files_of_a_folder_become_assets(tmp_path):
     (tmp_path / "a.stl").write_bytes(b"mesh")
     assets: dict[str, bytes] = {}
-    compat.update_assets(assets, tmp_path, meshdir="meshes", glob="*.stl")
+    older.update_assets(assets, tmp_path, meshdir="meshes", glob="*.stl")
     assert assets == {"meshes/a.stl": b"mesh"}
 
 
@@ -117,6 +118,6 @@ def test_the_shortest_rotation_turns_one_vector_into_the_other(to):
     import numpy as np
     from scipy.spatial.transform import Rotation
 
-    w, *xyz = compat.rotation_quat_from_vectors((0, 0, 2), to)
+    w, *xyz = older.rotation_quat_from_vectors((0, 0, 2), to)
     turned = Rotation.from_quat([*xyz, w]).apply([0, 0, 1])
     np.testing.assert_allclose(turned, np.array(to) / np.linalg.norm(to), atol=1e-9)

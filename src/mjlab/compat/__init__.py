@@ -3,9 +3,13 @@
 Task packages in the field were written against any release from 1.1 to 1.6. What a later release
 renamed, dropped or made stricter still works: a module that once offered more names ends with
 `__getattr__ = older_names(__name__)`, and a config class that once took more fields, or demanded
-fewer, carries `@accepts_older_fields`. Each use warns once, naming today's spelling.
+fewer, carries `@accepts_older_fields`.
 
-Nothing is imported before an older name is asked for.
+Deprecation policy: each use warns once, naming today's spelling, and all of it stays through 1.x
+and is removed in 2.0.
+
+Nothing is imported before an older name is asked for. Names without a successor are in
+`mjlab.compat.older`.
 """
 
 from __future__ import annotations
@@ -14,10 +18,8 @@ import dataclasses
 import functools
 import importlib
 import inspect
-import time
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, TypeVar
 
 C = TypeVar("C", bound=type)
@@ -25,15 +27,15 @@ C = TypeVar("C", bound=type)
 # Where an older name lives today, as "module:name".
 _EVENTS = {
     "EntityIndexing": "mjlab.entity:EntityIndexing",
-    "FieldSpec": "mjlab.envs.mdp.dr.older:FieldSpec",
+    "FieldSpec": "mjlab.compat.older:FieldSpec",
     "randomize_effort_limits": "mjlab.envs.mdp.dr:effort_limits",
     "randomize_encoder_bias": "mjlab.envs.mdp.dr:encoder_bias",
-    "randomize_field": "mjlab.envs.mdp.dr.older:randomize_field",
+    "randomize_field": "mjlab.compat.older:randomize_field",
     "randomize_pd_gains": "mjlab.envs.mdp.dr:pd_gains",
     "requires_model_fields": "mjlab.managers.event_manager:requires_model_fields",
     "sample_gaussian": "mjlab.utils.lab_api.math:sample_gaussian",
     "sample_log_uniform": "mjlab.utils.lab_api.math:sample_log_uniform",
-    "sync_actuator_delays": "mjlab.envs.mdp.dr.older:sync_actuator_delays",
+    "sync_actuator_delays": "mjlab.compat.older:sync_actuator_delays",
 }
 _XML_ACTUATORS = {
     f"Xml{kind}Actuator{suffix}": f"mjlab.actuator.xml_actuator:XmlActuator{suffix}"
@@ -41,18 +43,17 @@ _XML_ACTUATORS = {
     for suffix in ("", "Cfg")
 }
 _DELAYED_ACTUATORS = {
-    name: f"mjlab.actuator.older:{name}" for name in ("DelayedActuator", "DelayedActuatorCfg")
+    name: f"mjlab.compat.older:{name}" for name in ("DelayedActuator", "DelayedActuatorCfg")
 }
 _REWARD_WEIGHT = {
-    name: f"mjlab.envs.mdp.older_curriculums:{name}"
-    for name in ("RewardWeightStage", "reward_weight")
+    name: f"mjlab.compat.older:{name}" for name in ("RewardWeightStage", "reward_weight")
 }
-_FLAT_ORIENTATION = {"flat_orientation": "mjlab.tasks.velocity.mdp.older:flat_orientation"}
+_FLAT_ORIENTATION = {"flat_orientation": "mjlab.compat.older:flat_orientation"}
 _TERRAIN_IMPORTER = {
     "TerrainImporter": "mjlab.terrains.terrain_entity:TerrainEntity",
     "TerrainImporterCfg": "mjlab.terrains.terrain_entity:TerrainEntityCfg",
 }
-_ROBOT_FILES = {"get_assets": "mjlab.compat:get_assets"}
+_ROBOT_FILES = {"get_assets": "mjlab.compat.older:get_assets"}
 _VISER = {
     name: f"mjviser.conversions:{name}"
     for name in (
@@ -69,7 +70,7 @@ _VISER = {
         "rotation_matrix_from_vectors",
     )
 }
-_VISER["rotation_quat_from_vectors"] = "mjlab.compat:rotation_quat_from_vectors"
+_VISER["rotation_quat_from_vectors"] = "mjlab.compat.older:rotation_quat_from_vectors"
 
 _NAMES: dict[str, dict[str, str]] = {
     "mjlab.actuator": {**_XML_ACTUATORS, **_DELAYED_ACTUATORS},
@@ -90,9 +91,9 @@ _NAMES: dict[str, dict[str, str]] = {
     "mjlab.tasks.velocity.mdp.rewards": _FLAT_ORIENTATION,
     "mjlab.terrains": _TERRAIN_IMPORTER,
     "mjlab.terrains.terrain_importer": _TERRAIN_IMPORTER,
-    "mjlab.utils.os": {"update_assets": "mjlab.compat:update_assets"},
-    "mjlab.utils.spec": {"disable_collision": "mjlab.compat:disable_collision"},
-    "mjlab.viewer.base": {"Timer": "mjlab.compat:Timer"},
+    "mjlab.utils.os": {"update_assets": "mjlab.compat.older:update_assets"},
+    "mjlab.utils.spec": {"disable_collision": "mjlab.compat.older:disable_collision"},
+    "mjlab.viewer.base": {"Timer": "mjlab.compat.older:Timer"},
     "mjlab.viewer.viser": _VISER,
 }
 
@@ -223,62 +224,7 @@ def accepts_older_fields(config_class: C) -> C:
     return config_class
 
 
-# Small things that have no successor, as they were.
-
-
-def disable_collision(geom: Any) -> None:
-    """Switch off the contacts of a geom of a spec."""
-    geom.contype = 0
-    geom.conaffinity = 0
-
-
-def update_assets(
-    assets: dict[str, Any],
-    path: str | Path,
-    meshdir: str | None = None,
-    glob: str = "*",
-    recursive: bool = False,
-) -> None:
-    """Add the contents of the files in a folder to `assets`, by `<meshdir>/<file name>`."""
-    folder = Path(path)
-    for file in folder.rglob(glob) if recursive else folder.glob(glob):
-        if file.is_file():
-            assets[f"{meshdir}/{file.name}" if meshdir else file.name] = file.read_bytes()
-
-
-def get_assets(meshdir: str) -> dict[str, bytes]:
-    """Return the mesh files of a robot by path: none, as ours are drawn with primitive shapes."""
-    return {}
-
-
 def set_array_field(field: Any, values: Any) -> None:
     """Write `values` into the first elements of an array field of a spec; None leaves it."""
     for index, value in enumerate(values or ()):
         field[index] = value
-
-
-def rotation_quat_from_vectors(from_vec: Any, to_vec: Any) -> Any:
-    """Return the quaternion (w, x, y, z) of the shortest rotation between two vectors."""
-    import numpy as np
-
-    start = np.asarray(from_vec, dtype=float) / np.linalg.norm(from_vec)
-    end = np.asarray(to_vec, dtype=float) / np.linalg.norm(to_vec)
-    quat = np.array([1.0 + start @ end, *np.cross(start, end)])
-    if quat[0] < 1e-9:
-        # Opposite vectors: half a turn about any axis across them.
-        axis = np.cross(start, np.eye(3)[np.argmin(np.abs(start))])
-        quat = np.array([0.0, *axis])
-    return quat / np.linalg.norm(quat)
-
-
-class Timer:
-    """Measures wall time between ticks, in seconds."""
-
-    def __init__(self) -> None:
-        self._previous = time.time()
-
-    def tick(self) -> float:
-        """Return the time since the last tick."""
-        now = time.time()
-        elapsed, self._previous = now - self._previous, now
-        return elapsed
