@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import importlib.util
+import inspect
 import sys
 import warnings
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from public_interface import Entry, command_line, entries, problems
+from public_interface import Entry, command_line, config_kinds, entries, problems, resolve
 
 # What differs on purpose.
 DEVIATIONS = {
@@ -57,6 +58,31 @@ def test_a_name_is_as_the_interface_has_it(entry):
         found = set(problems(entry))
     expected = DEVIATIONS.get(entry.path, set())
     assert found == expected
+
+
+CONFIG_KINDS = config_kinds()
+# Here the function comes first, as in other terms; 1.6.0 has it as a keyword behind `params`.
+MORE_LENIENT = {"mjlab.managers.reward_manager.RewardTermCfg"}
+
+
+def test_the_constructors_of_all_configs_were_read():
+    assert len(CONFIG_KINDS) > 100
+    assert sum(not positional for positional, _ in CONFIG_KINDS.values()) > 30
+
+
+@pytest.mark.parametrize("path", CONFIG_KINDS)
+def test_a_config_takes_the_same_arguments_by_position_and_by_keyword(path):
+    positional, keyword_only = CONFIG_KINDS[path]
+    parameters = inspect.signature(resolve(path)).parameters
+    found = [name for name, p in parameters.items() if p.kind is p.POSITIONAL_OR_KEYWORD]
+    assert set(positional + keyword_only) <= set(parameters)
+    if path in MORE_LENIENT:
+        assert found[0] == "func"
+        return
+    assert found[: len(positional)] == positional
+    assert not set(keyword_only) & set(found)
+    if not positional:
+        assert not found
 
 
 @pytest.mark.parametrize("path", command_line())

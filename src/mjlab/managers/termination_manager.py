@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
 
-@dataclass(kw_only=True)
+@dataclass
 class TerminationTermCfg(ManagerTermBaseCfg):
     """A reason to end an episode: `func(env, **params)` returns one bool for each environment."""
 

@@ -64,7 +64,7 @@ class ContactMatch:
         return (self.pattern,) if isinstance(self.pattern, str) else tuple(self.pattern)
 
 
-@dataclass(kw_only=True)
+@dataclass
 class ContactSensorCfg(SensorCfg):
     """Describes a sensor of the contacts of some elements, with anything or with one other element.
 

@@ -42,7 +42,7 @@ __all__ = [
 NUM_GEOM_GROUPS = 6
 
 
-@dataclass(kw_only=True)
+@dataclass
 class RayCastSensorCfg(SensorCfg):
     """Describes a ray sensor."""
 
