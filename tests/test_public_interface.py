@@ -121,10 +121,10 @@ def test_the_fields_of_a_command_line_are_there(path):
             "field timestep has the default 0.002, not 0.003",
         ),
         (
-            "mjlab.envs",
-            "class ManagerBasedRlEnvCfg()  [dataclass]",
-            ("scene: SceneCfg", "decimation: int"),
-            "field decimation comes too early",
+            "mjlab.sim",
+            "class MujocoCfg()  [dataclass]",
+            ("integrator: str", "timestep: float"),
+            "field timestep comes too early",
         ),
         ("mjlab.envs", "class ManagerBasedRlEnv()", ("gone(self) -> None",), "method gone is missing"),
         (
@@ -135,6 +135,32 @@ def test_the_fields_of_a_command_line_are_there(path):
         ),
         ("mjlab.envs", "class ManagerBasedRlEnv()", ("@property gone -> int",), "property gone is missing"),
         ("mjlab.envs", "class ManagerBasedRlEnv()", ("@property step -> int",), "property step is a method"),
+        ("mjlab", "MJLAB_SRC_PATH: dict", (), "is of type PosixPath, not dict"),
+        (
+            "mjlab.asset_zoo.robots",
+            "YAM_ACTION_SCALE: dict of 3: joint1, joint2, joint4",
+            (),
+            "has 7 elements, not 3",
+        ),
+        (
+            "mjlab.asset_zoo.robots",
+            "YAM_ACTION_SCALE: dict of 7: joint2, joint1",
+            (),
+            "starts with ['joint1', 'joint2'], not ['joint2', 'joint1']",
+        ),
+        (
+            "mjlab.managers",
+            "EventMode = Literal['startup', 'reset']  [type alias]",
+            (),
+            "allows ['startup', 'reset', 'interval', 'step'], not ['startup', 'reset']",
+        ),
+        (
+            "mjlab.envs.mdp.events",
+            "class apply_body_impulse()",
+            ("class VizCfg(scale, rgba)",),
+            "VizCfg: has fields ['rgba', 'scale', 'width', 'min_force'], not ['scale', 'rgba']",
+        ),
+        ("mjlab.entity", "class EntityData()", ("POS_DIM = 4",), "POS_DIM is 3, not 4"),
         ("mjlab.actuator.actuator", "class TransmissionType(str)", ("JOINT = 'x'",), "JOINT is 'joint', not 'x'"),
     ],
 )  # fmt: skip
