@@ -16,7 +16,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mjlab import compat
+
 LIST = Path(__file__).parent / "data" / "public_interface.txt"
+OLDER = Path(__file__).parent / "data" / "older_interface.txt"
 KINDS = Path(__file__).parent / "data" / "config_kinds.txt"
 
 # Technical names that modules of 1.6 happened to import or define.
@@ -59,6 +62,38 @@ def entries() -> list[Entry]:
         elif line.strip() and line not in NOISE:
             found.append(Entry(module, _name(line), line))
     return found
+
+
+def older_entries() -> list[Entry]:
+    """Return the names that releases before 1.6 had; members of classes are `Class.member`."""
+    found: list[Entry] = []
+    module = ""
+    for line in OLDER.read_text().splitlines():
+        text = line.partition("   [")[0].strip()
+        if line.startswith("## "):
+            module = line[3:].strip()
+        elif line.startswith("# Fields whose default"):
+            break
+        elif module and text:
+            name = re.match(r"(?:def |class |exported )?([\w.@]+(?: \w+)?)", text)
+            assert name, line
+            found.append(Entry(module, name.group(1), text))
+    return found
+
+
+def is_offered(entry: Entry) -> bool:
+    """Return whether a name of an earlier release is there, with its signature."""
+    module = importlib.import_module(entry.module)
+    if entry.line.startswith("def "):
+        return not problems(dataclasses.replace(entry, name=_name(entry.line)))
+    if entry.line.startswith(("class ", "exported ")):
+        return hasattr(module, entry.name.split()[0])
+    owner, _, member = entry.line.partition(".")
+    member = re.sub(r"^@\w+ ", "", member)
+    name = re.match(r"\w+", member).group()
+    cls = getattr(module, owner)
+    # Fields that are gone are arguments of the constructor still.
+    return hasattr(cls, name) or name in compat._DROPPED_FIELDS.get(owner, {})
 
 
 def command_line() -> dict[str, list[str]]:

@@ -14,7 +14,16 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from public_interface import Entry, command_line, config_kinds, entries, problems, resolve
+from public_interface import (
+    Entry,
+    command_line,
+    config_kinds,
+    entries,
+    is_offered,
+    older_entries,
+    problems,
+    resolve,
+)
 
 # What differs on purpose.
 DEVIATIONS = {
@@ -58,6 +67,16 @@ def test_a_name_is_as_the_interface_has_it(entry):
         found = set(problems(entry))
     expected = DEVIATIONS.get(entry.path, set())
     assert found == expected
+
+
+def test_the_list_of_earlier_names_was_read_in_full():
+    assert len(older_entries()) > 110
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+@pytest.mark.parametrize("entry", older_entries(), ids=lambda entry: entry.path)
+def test_a_name_of_an_earlier_release_is_there(entry):
+    assert is_offered(entry)
 
 
 CONFIG_KINDS = config_kinds()
