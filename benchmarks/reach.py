@@ -96,7 +96,7 @@ class Reach:
         self.env, self.term = env, term
         self.arm = env.scene["robot"].data
         self.joints = term._columns
-        position, quat = (part.clone() for part in term._frame_pose())
+        position, quat = (part.clone() for part in term._get_frame_pose())
         generator = torch.Generator().manual_seed(0)
         direction = torch.randn(NUM_ARMS, 3, generator=generator)
         direction /= direction.norm(dim=1, keepdim=True)
@@ -106,7 +106,7 @@ class Reach:
 
     def residuals(self) -> torch.Tensor:
         """Return each hand's distance from its target, in metres."""
-        return (self.term._frame_pose()[0] - self.target).norm(dim=1)
+        return (self.term._get_frame_pose()[0] - self.target).norm(dim=1)
 
     def watch_limits(self) -> None:
         """Note how far any joint of any arm is past its limit (rad; negative: within)."""

@@ -110,7 +110,9 @@ def draw_variants(path: Path) -> None:
     exec(page.split("```python\n")[1].split("```")[0], example)
     plane = TerrainEntityCfg(terrain_type="plane")
     entities = {"object": example["object_cfg"]}
-    scene = Scene(SceneCfg(12, env_spacing=0.3, terrain=plane, entities=entities), device="cpu")
+    scene = Scene(
+        SceneCfg(num_envs=12, env_spacing=0.3, terrain=plane, entities=entities), device="cpu"
+    )
     sim = Simulation(
         scene.num_envs,
         SimulationCfg(engine="native"),

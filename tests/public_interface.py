@@ -9,12 +9,25 @@ import importlib
 import inspect
 import math
 import re
+import tempfile
+import typing
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mjlab import compat
+
 LIST = Path(__file__).parent / "data" / "public_interface.txt"
+OLDER = Path(__file__).parent / "data" / "older_interface.txt"
+KINDS = Path(__file__).parent / "data" / "config_kinds.txt"
+
+# Technical names that modules of 1.6 happened to import or define.
+NOISE = {
+    "Dict = Dict  [type alias]",
+    "Tuple = Tuple  [type alias]",
+    "T: TypeVar",
+}
 
 _EMPTY = inspect.Parameter.empty
 # Bases that say how a class is made, not what it is.
@@ -46,9 +59,41 @@ def entries() -> list[Entry]:
                 break
         elif line.startswith(" "):
             found[-1] = dataclasses.replace(found[-1], members=(*found[-1].members, line.strip()))
-        elif line.strip():
+        elif line.strip() and line not in NOISE:
             found.append(Entry(module, _name(line), line))
     return found
+
+
+def older_entries() -> list[Entry]:
+    """Return the names that releases before 1.6 had; members of classes are `Class.member`."""
+    found: list[Entry] = []
+    module = ""
+    for line in OLDER.read_text().splitlines():
+        text = line.partition("   [")[0].strip()
+        if line.startswith("## "):
+            module = line[3:].strip()
+        elif line.startswith("# Fields whose default"):
+            break
+        elif module and text:
+            name = re.match(r"(?:def |class |exported )?([\w.@]+(?: \w+)?)", text)
+            assert name, line
+            found.append(Entry(module, name.group(1), text))
+    return found
+
+
+def is_offered(entry: Entry) -> bool:
+    """Return whether a name of an earlier release is there, with its signature."""
+    module = importlib.import_module(entry.module)
+    if entry.line.startswith("def "):
+        return not problems(dataclasses.replace(entry, name=_name(entry.line)))
+    if entry.line.startswith(("class ", "exported ")):
+        return hasattr(module, entry.name.split()[0])
+    owner, _, member = entry.line.partition(".")
+    member = re.sub(r"^@\w+ ", "", member)
+    name = re.match(r"\w+", member).group()
+    cls = getattr(module, owner)
+    # Fields that are gone are arguments of the constructor still.
+    return hasattr(cls, name) or name in compat._DROPPED_FIELDS.get(owner, {})
 
 
 def command_line() -> dict[str, list[str]]:
@@ -63,6 +108,29 @@ def command_line() -> dict[str, list[str]]:
         elif line.startswith(" "):
             found[current].append(line.strip().partition(":")[0])
     return found
+
+
+def config_kinds() -> dict[str, tuple[list[str], list[str]]]:
+    """Return the positional and the keyword-only parameters of config classes, by path."""
+    found = {}
+    for line in KINDS.read_text().splitlines():
+        if not line.startswith("#"):
+            path, _, parameters = line.partition(":")
+            positional, keyword_only = (
+                [name.strip() for name in part.split(",") if name.strip()]
+                for part in parameters.split("|")
+            )
+            found[path] = (positional, keyword_only)
+    return found
+
+
+def resolve(path: str) -> Any:
+    """Return what `module.Class.Nested` names."""
+    module, _, name = path.rpartition(".")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except ModuleNotFoundError:
+        return getattr(resolve(module), name)
 
 
 def _name(line: str) -> str:
@@ -90,10 +158,44 @@ def problems(entry: Entry) -> list[str]:
 
 
 def _constant_problems(line: str, value: Any) -> Iterator[str]:
+    if re.match(r"\w+: ", line):
+        yield from _kind_problems(line.partition(": ")[2], value)
+        return
     _, _, text = line.partition(" = ")
+    if text.endswith("[type alias]"):
+        yield from _alias_problems(text.removesuffix("[type alias]").strip(), value)
+        return
     expected = _parsed(text)
     if isinstance(expected, ast.expr) and not _agrees(expected, value):
         yield f"is {value!r}, not {text}"
+
+
+def _kind_problems(text: str, value: Any) -> Iterator[str]:
+    """Compare a value with a description: `dict of 3: a, b`, `frozenset of 2: a, b` or a class.
+
+    Up to four elements of a collection are listed, those of a dict in order; sets may hold more.
+    """
+    kind, _, elements = text.partition(" of ")
+    if kind not in {base.__name__ for base in type(value).__mro__}:
+        yield f"is of type {type(value).__name__}, not {kind}"
+    elif elements:
+        size, _, names = elements.partition(": ")
+        listed = [name.strip() for name in names.split(",")]
+        if len(value) < int(size) or (kind == "dict" and len(value) > int(size)):
+            yield f"has {len(value)} elements, not {size}"
+        if kind == "dict" and list(value)[: len(listed)] != listed:
+            yield f"starts with {list(value)[: len(listed)]}, not {listed}"
+        yield from (f"lacks {name}" for name in listed if name not in value)
+
+
+def _alias_problems(text: str, value: Any) -> Iterator[str]:
+    expected = _parsed(text)
+    if expected is None or not text.startswith("Literal["):
+        return
+    # Aliases of other kinds are compared by type checkers.
+    choices = ast.literal_eval(text.removeprefix("Literal"))
+    if list(typing.get_args(value)) != choices:
+        yield f"allows {list(typing.get_args(value))}, not {choices}"
 
 
 def _class_problems(entry: Entry, cls: Any) -> Iterator[str]:
@@ -171,6 +273,9 @@ def _member_problems(member: str, cls: Any) -> Iterator[str]:
         return
     if "(" not in text:
         return
+    if member.startswith("class "):
+        yield from (f"{name}: {line}" for line in _nested_class_problems(text, name, cls))
+        return
     if not hasattr(cls, name):
         yield f"method {name} is missing"
         return
@@ -178,6 +283,18 @@ def _member_problems(member: str, cls: Any) -> Iterator[str]:
     if kind in ("@staticmethod", "@classmethod") and type(function).__name__ != kind[1:]:
         yield f"{name} is not a {kind[1:]}"
     yield from (f"{name}: {line}" for line in _signature_problems(text, getattr(cls, name)))
+
+
+def _nested_class_problems(text: str, name: str, cls: Any) -> Iterator[str]:
+    """Compare a nested config with `class Name(field, field)`."""
+    nested = getattr(cls, name, None)
+    if not dataclasses.is_dataclass(nested):
+        yield "is missing or no dataclass"
+        return
+    fields = [found.name for found in dataclasses.fields(nested)]
+    listed = [field.strip() for field in text.partition("(")[2].rstrip(")").split(",")]
+    if fields[: len(listed)] != listed:
+        yield f"has fields {fields}, not {listed}"
 
 
 def _instance_attributes(cls: Any) -> set[str]:
@@ -278,6 +395,8 @@ def _agrees(expected: ast.expr, value: Any) -> bool:
         plain = value.value if isinstance(value, enum.Enum) else value
         same_name = not isinstance(value, enum.Enum) or value.name == shown.group(1)
         return same_name and plain == ast.literal_eval(shown.group(2))
+    if isinstance(literal, str) and literal.startswith("/tmp/"):
+        literal = literal.replace("/tmp", tempfile.gettempdir(), 1)
     if isinstance(literal, float) and isinstance(value, (int, float)):
         return math.isclose(literal, value, rel_tol=1e-9)
     if isinstance(value, enum.Enum) and isinstance(literal, (str, int)):

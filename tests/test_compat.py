@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
+import sys
 import warnings
 
+import numpy as np
 import pytest
+import torch
 
 from mjlab import compat
+from mjlab.compat import older
 from mjlab.managers import EventTermCfg
 from mjlab.rl import RslRlModelCfg
 from mjlab.utils.spec_config import CollisionCfg
@@ -108,15 +113,115 @@ def test_todays_spelling_does_not_warn():
 def test_files_of_a_folder_become_assets(tmp_path):
     (tmp_path / "a.stl").write_bytes(b"mesh")
     assets: dict[str, bytes] = {}
-    compat.update_assets(assets, tmp_path, meshdir="meshes", glob="*.stl")
+    older.update_assets(assets, tmp_path, meshdir="meshes", glob="*.stl")
     assert assets == {"meshes/a.stl": b"mesh"}
 
 
 @pytest.mark.parametrize("to", [(0, 0, 1), (0, 1, 0), (0, 0, -1), (1, 2, 3)])
 def test_the_shortest_rotation_turns_one_vector_into_the_other(to):
-    import numpy as np
     from scipy.spatial.transform import Rotation
 
-    w, *xyz = compat.rotation_quat_from_vectors((0, 0, 2), to)
+    w, *xyz = older.rotation_quat_from_vectors((0, 0, 2), to)
     turned = Rotation.from_quat([*xyz, w]).apply([0, 0, 1])
     np.testing.assert_allclose(turned, np.array(to) / np.linalg.norm(to), atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def cartpole():
+    from mjlab.envs import ManagerBasedRlEnv, mdp
+    from mjlab.managers import MetricsTermCfg
+    from mjlab.tasks.registry import load_env_cfg
+
+    cfg = load_env_cfg("Mjlab-Cartpole-Balance")
+    cfg.scene.num_envs, cfg.seed, cfg.sim.engine = 2, 1, "native"
+    cfg.metrics = {"acceleration": MetricsTermCfg(func=mdp.mean_action_acc)}
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    env.reset()
+    for sign in (1.0, -1.0, 1.0):
+        env.step(torch.full((2, 1), sign))
+    return env
+
+
+ignore_older = pytest.mark.filterwarnings("ignore:.*older:FutureWarning")
+
+
+@ignore_older
+def test_managers_answer_attributes_of_earlier_releases(cartpole):
+    metrics, observations = cartpole.metrics_manager, cartpole.observation_manager
+    assert torch.equal(metrics._step_count, torch.tensor([3, 3]))
+    assert list(metrics._episode_sums) == ["acceleration"]
+    assert (metrics._episode_sums["acceleration"] > 0).all()
+    cfgs = observations._group_obs_term_cfgs
+    assert {group: len(terms) for group, terms in cfgs.items()} == {
+        group: len(terms) for group, terms in observations.active_terms.items()
+    }
+    name = observations.active_terms["actor"][0]
+    assert cfgs["actor"][0] is observations.get_term_cfg("actor", name)
+    terminations = cartpole.termination_manager
+    terminations.time_outs[1] = True
+    assert terminations._truncated_buf.tolist() == [False, True]
+    terminations._truncated_buf[1] = False
+    assert not terminations.time_outs.any()
+
+
+def test_applied_generalized_forces_warn_once_and_are_read(cartpole):
+    robot = next(e for e in cartpole.scene.entities.values() if e.num_joints == 2)
+    cartpole.sim.data.qfrc_applied[:] = torch.tensor([[1.0, 2.0], [3.0, 4.0]])
+    with pytest.warns(FutureWarning, match=r"EntityData.generalized_force"):
+        force = robot.data.generalized_force
+    assert force.tolist() == [[1.0, 2.0], [3.0, 4.0]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert robot.data.generalized_force.shape == (2, 2)
+
+
+def test_an_attribute_that_is_set_hides_the_older_one():
+    from mjlab.managers import TerminationManager
+
+    class Own(TerminationManager):
+        def __init__(self):
+            self._truncated_buf = "own"
+
+    assert Own()._truncated_buf == "own"
+
+
+@ignore_older
+def test_flat_patches_of_a_field_of_integers_are_where_it_is_flat():
+    from mjlab.terrains import FlatPatchSamplingCfg
+    from mjlab.terrains.heightfield_terrains import _compute_flat_patches
+
+    rng = np.random.default_rng(0)
+    noise = 100 + (rng.random((40, 60)) * 500).astype(np.int16)
+    noise[5:15, 40:50] = 300
+    cfg = FlatPatchSamplingCfg(num_patches=3, patch_radius=0.3, max_height_diff=0.1)
+    patches = _compute_flat_patches(noise, 0.005, 0.1, 0.3, {"spawn": cfg}, rng)["spawn"]
+    assert patches.shape == (3, 3)
+    x, y, z = patches.T
+    assert ((x > 4.0) & (x < 5.0) & (y > 0.5) & (y < 1.5)).all()
+    np.testing.assert_allclose(z, 0.005 * (300 - noise.min()) + 0.3)
+    assert _compute_flat_patches(noise, 0.005, 0.1, 0.3, None, rng) is None
+
+
+@ignore_older
+def test_the_demo_motion_ships_and_the_checkpoint_says_what_to_do():
+    from mjlab.scripts import gcs
+    from mjlab.tasks.tracking.motion_file import read_motion
+
+    motion = read_motion(gcs.ensure_default_motion())
+    assert motion.num_frames > 10
+    assert str(gcs.ensure_asset_downloaded("demo_motion.npz")) == gcs.ensure_default_motion()
+    with pytest.raises(FileNotFoundError, match="train"):
+        gcs.ensure_default_checkpoint()
+    with pytest.raises(ValueError, match=r"demo_motion.npz.*'x'"):
+        gcs.ensure_asset_downloaded("x")
+
+
+def test_passing_names_on_imports_nothing():
+    # Modules of the table that themselves load only a few others, in a process of their own.
+    code = (
+        "import sys, mjlab.compat, mjlab.scripts.play, mjlab.scripts.train, mjlab.tasks.registry, "
+        "mjlab.scripts.csv_to_npz, mjlab.scripts.gcs; "
+        "print([name for name in ('torch', 'mujoco', 'mjlab.compat.older') if name in sys.modules])"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"

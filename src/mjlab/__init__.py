@@ -10,10 +10,14 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     TYRO_FLAGS: tuple[Any, ...]
+
+MJLAB_SRC_PATH = Path(__file__).parent
+"""Folder of this package."""
 
 
 def _prefer_egl() -> None:

@@ -125,7 +125,7 @@ def test_motors_and_gains_are_those_of_the_task_tables():
         (joint,): pytest.approx(figures[:4], rel=1e-9) for joint, figures in ACTUATORS.items()
     }
     assert articulation.soft_joint_pos_limit_factor == 0.9
-    assert [motor.velocity_limit for motor in (yam.ACTUATOR_DM_4340, yam.ACTUATOR_DM_4310)] == [
+    assert [motor.velocity_limit for motor in (yam.DM_4340, yam.DM_4310)] == [
         10.0,
         30.0,
     ]

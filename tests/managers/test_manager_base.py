@@ -347,11 +347,11 @@ def test_the_command_line_can_read_the_types_of_config_fields(cfg_class):
 
 
 def test_client_configs_may_add_required_fields():
-    @dataclasses.dataclass
+    @dataclasses.dataclass(kw_only=True)
     class MyTermCfg(RewardTermCfg):
         target: float
 
-    cfg = MyTermCfg(value, 2.0, weight=1.0)
+    cfg = MyTermCfg(value, target=2.0, weight=1.0)
     assert (cfg.func, cfg.target, cfg.weight, cfg.params) == (value, 2.0, 1.0, {})
 
 

@@ -388,3 +388,32 @@ def test_weights_and_biases_gets_figures_and_files_only_on_request(
     make_runner(tmp_path / "kept", logger="wandb", upload_model=False).learn(1)
     assert not [args for name, args in calls if name == "save" and "kept." in args[0]]
     assert not [args for name, args in calls if name == "save" and "model_" in args[0]]
+
+
+@pytest.mark.parametrize("base", ["MjlabOnPolicyRunner", "ExportingOnPolicyRunner"])
+def test_a_subclass_decides_where_policies_are_exported(make_runner, tmp_path: Path, base):
+    from mjlab import rl
+    from mjlab.rl.exporting_runner import ExportingOnPolicyRunner
+
+    class Own(
+        {"ExportingOnPolicyRunner": ExportingOnPolicyRunner}.get(base, rl.MjlabOnPolicyRunner)
+    ):
+        @staticmethod
+        def _get_export_paths(checkpoint_path: str) -> tuple[Path, str, Path]:
+            folder = Path(checkpoint_path).parent / "exported"
+            name = f"{Path(checkpoint_path).stem}.onnx"
+            return folder, name, folder / name
+
+    runner = make_runner(tmp_path / "run")
+    runner.__class__ = Own
+    runner.learn(1)
+    assert [p.name for p in (tmp_path / "run" / "exported").iterdir()] == ["model_0.onnx"]
+    assert not list((tmp_path / "run").glob("*.onnx"))
+
+
+def test_policies_are_exported_beside_the_checkpoint_under_the_name_of_the_run(tmp_path: Path):
+    from mjlab.rl import MjlabOnPolicyRunner
+
+    folder, name, path = MjlabOnPolicyRunner._get_export_paths(str(tmp_path / "run" / "model_7.pt"))
+    assert (folder, name) == (tmp_path / "run", "run.onnx")
+    assert path == folder / name

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -358,3 +359,25 @@ def test_its_help_needs_nothing_heavy():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "--input-file FILE" in done.stdout
+
+
+@pytest.mark.filterwarnings("ignore:.*older:FutureWarning")
+def test_run_sim_writes_the_motion_of_a_scene_whatever_the_order_of_joints(
+    csv, tmp_path, monkeypatch
+):
+    from mjlab.scripts.csv_to_npz import run_sim
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    expected = converted(csv, tmp_path)
+    backwards = tmp_path / "backwards.csv"
+    table = np.loadtxt(csv, delimiter=",")
+    np.savetxt(backwards, np.hstack((table[:, :7], table[:, :6:-1])), delimiter=",")
+    g1 = get_g1_robot_cfg().build()
+    defaults = SimpleNamespace(default_joint_pos=torch.zeros(1, 29))
+    robot = SimpleNamespace(cfg=g1.cfg, find_joints=g1.find_joints, data=defaults)
+    run_sim(None, {"robot": robot}, JOINTS[::-1], str(backwards), 30.0, 50.0, "dance", False, None)
+    for path in (tmp_path / "dance.npz", tmp_path / "temporary" / "motion.npz"):
+        motion = read_motion(path)
+        np.testing.assert_allclose(motion.joint_pos, expected.joint_pos, atol=1e-6)
+        np.testing.assert_allclose(motion.body_pos_w, expected.body_pos_w, atol=1e-6)

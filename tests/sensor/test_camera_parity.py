@@ -138,7 +138,9 @@ def test_each_environment_sees_its_own_variant():
     images = {}
     for engine in ENGINES:
         entity = VariantEntityCfg(variants={n: lambda n=n: _spec_of(shapes[n]) for n in shapes})
-        scene = Scene(SceneCfg(3, entities={"object": entity}, sensors=(eye,), extent=2.0), "cpu")
+        scene = Scene(
+            SceneCfg(num_envs=3, entities={"object": entity}, sensors=(eye,), extent=2.0), "cpu"
+        )
         sim = Simulation(
             3,
             SimulationCfg(engine=engine),

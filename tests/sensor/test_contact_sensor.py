@@ -379,3 +379,23 @@ def test_contacts_are_drawn_where_the_config_says_debug(reduce):
     data = scene["touch"].data
     assert data.dist is not None
     assert data.found is data.pos is data.force is None, "only what was asked for"
+
+
+# Attributes of 1.6.
+
+
+@pytest.mark.filterwarnings("ignore:.*older:FutureWarning")
+def test_slots_are_live_views_of_each_field_of_each_primary():
+    cfg = sense(geom("box"), TERRAIN, fields=("found", "force", "dist"), reduce="none", num_slots=4)
+    sim, scene = build(cfg, box=BOX)
+    sensor = scene["touch"]
+    slots = {slot.field_name: slot for slot in sensor._slots}
+    assert list(slots) == ["found", "force", "dist"]
+    assert {slot.primary_name for slot in slots.values()} == {"box"}
+    settle(sim)
+    data = sensor.data
+    assert_close(slots["found"].data_view, data.found)
+    assert_close(slots["dist"].data_view, data.dist)
+    assert_close(slots["force"].data_view, data.force.reshape(2, 12))
+    assert slots["force"].data_view.abs().sum() > 1.0
+    sim.mj_model.sensor(slots["found"].sensor_name)

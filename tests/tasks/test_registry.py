@@ -196,3 +196,23 @@ def test_a_subpackage_that_fails_to_import_leaves_no_task(monkeypatch, tmp_path,
     assert "Mjlab-Cartpole-Balance" in tasks
     assert "half way" in caplog.text
     assert "mjlab.tasks.broken_tasks_of_test" in caplog.text
+
+
+@pytest.mark.filterwarnings("ignore:.*older:FutureWarning")
+def test_the_registry_reads_as_a_dict():
+    rl_cfg = RslRlOnPolicyRunnerCfg()
+    register_mjlab_task("Own", with_play, rl_cfg=rl_cfg, runner_cls=MjlabOnPolicyRunner)
+    tasks = registry._REGISTRY
+    assert list(tasks) == list_tasks()
+    assert len(tasks) == len(list_tasks())
+    assert ("Own" in tasks, "Other" in tasks) == (True, False)
+    assert tasks["Own"].env_cfg.decimation == 1
+    assert tasks["Own"].play_env_cfg.decimation == 2
+    assert tasks["Own"].rl_cfg == rl_cfg
+    assert tasks["Own"].runner_cls is MjlabOnPolicyRunner
+    task = tasks.pop("Own")
+    assert "Own" not in list_tasks()
+    tasks["Again"] = task
+    assert load_env_cfg("Again", play=True).decimation == 2
+    with pytest.raises(KeyError, match="Other"):
+        tasks["Other"]

@@ -21,6 +21,7 @@ from mjlab.actuator.command import ActuatorCmd as ActuatorCmd
 from mjlab.actuator.command import TransmissionType as TransmissionType
 from mjlab.actuator.command import read_command
 from mjlab.utils.buffers import DelayBuffer
+from mjlab.utils.mujoco import CommandField as CommandField
 from mjlab.utils.state import stateful
 from mjlab.utils.substep import is_constant_within_step
 

@@ -26,7 +26,7 @@ class DcMotorInputMode(IntEnum):
     VELOCITY = 2
 
 
-@dataclass(kw_only=True)
+@dataclass
 class DcMotorDatasheetParams:
     """A DC motor by the figures of its data sheet."""
 
@@ -38,7 +38,7 @@ class DcMotorDatasheetParams:
     """Speed without load (rad/s)."""
 
 
-@dataclass(kw_only=True)
+@dataclass
 class DcMotorPhysicalParams:
     """A DC motor by its physical constants."""
 

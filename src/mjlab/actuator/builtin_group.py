@@ -16,12 +16,23 @@ from mjlab.actuator._columns import (
 from mjlab.actuator._delay import delay_rows
 from mjlab.actuator._grouping import acts_like, delay_settings, share_line
 from mjlab.actuator.actuator import Actuator
+from mjlab.actuator.builtin_actuator import (
+    BuiltinMotorActuator,
+    BuiltinMuscleActuator,
+    BuiltinPositionActuator,
+    BuiltinVelocityActuator,
+)
 from mjlab.actuator.command import target_field
 from mjlab.actuator.direct import DirectActuator
 from mjlab.utils.buffers import DelayBuffer
 
 if TYPE_CHECKING:
     from mjlab.entity import EntityData
+
+BuiltinActuatorType = (
+    BuiltinMotorActuator | BuiltinMuscleActuator | BuiltinPositionActuator | BuiltinVelocityActuator
+)
+"""Actuators whose control is one target."""
 
 
 @dataclass

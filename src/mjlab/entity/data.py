@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from mjlab.compat import offers_older_attributes, older_names
 from mjlab.entity.indexing import EntityIndexing
 from mjlab.entity.kinematics import KinematicsReader
 from mjlab.entity.kinematics import compute_velocity_from_cvel as compute_velocity_from_cvel
@@ -14,6 +15,7 @@ from mjlab.entity.state_writer import EnvIds, StateWriter
 from mjlab.utils.state import stateful
 
 
+@offers_older_attributes
 @stateful
 @dataclass(eq=False)
 class EntityData(KinematicsReader, StateWriter):
@@ -34,6 +36,14 @@ class EntityData(KinematicsReader, StateWriter):
     _transient = {
         "indexing", "data", "model", "device", "_views", "gravity_vec_w", "forward_vec_b",
     }  # fmt: skip
+
+    POS_DIM = 3
+    QUAT_DIM = 4
+    LIN_VEL_DIM = 3
+    ANG_VEL_DIM = 3
+    ROOT_POSE_DIM = POS_DIM + QUAT_DIM
+    ROOT_VEL_DIM = LIN_VEL_DIM + ANG_VEL_DIM
+    ROOT_STATE_DIM = ROOT_POSE_DIM + ROOT_VEL_DIM
 
     indexing: EntityIndexing
     """Where the entity's elements are in the model."""
@@ -162,3 +172,6 @@ class EntityData(KinematicsReader, StateWriter):
             - self._columns("qfrc_passive", at)
             + self._columns("qfrc_bias", at)
         )
+
+
+__getattr__ = older_names(__name__)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -19,6 +19,7 @@ from mjlab.entity._variant_assignment import assign_worlds, resolve_assignment
 from mjlab.entity._variant_merge import merge_specs, refuse_references
 from mjlab.entity._variant_signatures import RESERVED_NAME_PREFIXES as RESERVED_NAME_PREFIXES
 from mjlab.entity._variant_signatures import BodySignature as BodySignature
+from mjlab.entity._variant_signatures import GeomRole as GeomRole
 from mjlab.entity._variant_signatures import GeomSignature as GeomSignature
 from mjlab.entity._variant_signatures import JointSignature as JointSignature
 from mjlab.entity._variant_signatures import validate_variant_specs as validate_variant_specs
@@ -31,6 +32,9 @@ from mjlab.entity.entity import Entity, EntityCfg
 from mjlab.sim.engines.field_lists import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
 from mjlab.sim.variants import VARIANT_DEPENDENT_FIELDS as VARIANT_DEPENDENT_FIELDS
 from mjlab.sim.variants import VariantColumns, VariantInfo, VariantValues
+
+InertialMode = Literal["mesh-derived", "diagonal", "fullinertia"]
+"""Source of a body's inertia: its geoms, `diaginertia` or `fullinertia`."""
 
 
 def _variant_spec_fn_unset() -> mujoco.MjSpec:

@@ -9,10 +9,14 @@ from mjlab.utils.lazy import lazy_names
 if TYPE_CHECKING:
     from mjlab.envs.env_cfg import ManagerBasedRlEnvCfg as ManagerBasedRlEnvCfg
     from mjlab.envs.manager_based_rl_env import ManagerBasedRlEnv as ManagerBasedRlEnv
+    from mjlab.envs.types import VecEnvObs as VecEnvObs
+    from mjlab.envs.types import VecEnvStepReturn as VecEnvStepReturn
 
 _LAZY = {
     "ManagerBasedRlEnv": "mjlab.envs.manager_based_rl_env",
     "ManagerBasedRlEnvCfg": "mjlab.envs.env_cfg",
+    "VecEnvObs": "mjlab.envs.types",
+    "VecEnvStepReturn": "mjlab.envs.types",
 }
 
 # A config needs the config class alone; the environment loads when one is built.

@@ -25,7 +25,7 @@ def _default_events() -> dict[str, EventTermCfg | None]:
     }
 
 
-@dataclass
+@dataclass(kw_only=True)
 class ManagerBasedRlEnvCfg:
     """A task: a scene, and named terms for each part of the decision process.
 

@@ -16,6 +16,7 @@ import torch
 from mjlab.envs import env_state
 from mjlab.envs.env_cfg import ManagerBasedRlEnvCfg as ManagerBasedRlEnvCfg
 from mjlab.envs.env_checks import as_action, as_reset_ids, check_device, check_env_cfg
+from mjlab.envs.types import VecEnvObs, VecEnvStepReturn
 from mjlab.managers import (
     ActionManager,
     CommandManager,
@@ -43,8 +44,6 @@ if TYPE_CHECKING:
     from mjlab.viewer.offscreen_renderer import OffscreenRenderer
 
 logger = logging.getLogger(__name__)
-
-Observations = dict[str, torch.Tensor | dict[str, torch.Tensor]]
 
 
 class ManagerBasedRlEnv:
@@ -80,7 +79,7 @@ class ManagerBasedRlEnv:
         self.render_mode = render_mode
         self.metadata: dict[str, Any] = {"render_modes": [None, "rgb_array"]}
         self.extras: dict[str, Any] = {}
-        self.obs_buf: Observations = {}
+        self.obs_buf: VecEnvObs = {}
         self._device = device
         self.scene = Scene(cfg.scene, device=device)
         self.sim = self._create_simulation()
@@ -234,7 +233,7 @@ class ManagerBasedRlEnv:
         seed: int | None = None,
         env_ids: torch.Tensor | None = None,
         options: dict[str, Any] | None = None,
-    ) -> tuple[Observations, dict[str, Any]]:
+    ) -> tuple[VecEnvObs, dict[str, Any]]:
         """Start new episodes in `env_ids` (None: all); return observations and extras.
 
         A `seed` reseeds every random number generator. Observations are those of all
@@ -259,9 +258,7 @@ class ManagerBasedRlEnv:
         self.recorder_manager.record_post_reset(env_ids)
         return self.obs_buf, self.extras
 
-    def step(
-        self, action: torch.Tensor
-    ) -> tuple[Observations, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
+    def step(self, action: torch.Tensor) -> VecEnvStepReturn:
         """Advance all environments by one environment step.
 
         The order is: process actions; `decimation` physics substeps; terminations and rewards;
@@ -415,7 +412,7 @@ class ManagerBasedRlEnv:
         self.episode_length_buf[env_ids] = 0
         self._pending_reset[env_ids] = False
 
-    def get_observations(self) -> Observations:
+    def get_observations(self) -> VecEnvObs:
         """Return the observations of the last step or reset."""
         return self.observation_manager.compute()
 

@@ -12,7 +12,7 @@ from mjlab.managers.curriculum_manager import (
     CurriculumTermCfg,
     NullCurriculumManager,
 )
-from mjlab.managers.event_manager import EventManager, EventTermCfg
+from mjlab.managers.event_manager import EventManager, EventMode, EventTermCfg
 from mjlab.managers.manager_base import ManagerBase, ManagerTermBase, ManagerTermBaseCfg
 from mjlab.managers.metrics_manager import MetricsManager, MetricsTermCfg, NullMetricsManager
 from mjlab.managers.observation_manager import (
@@ -40,6 +40,7 @@ __all__ = [
     "CurriculumManager",
     "CurriculumTermCfg",
     "EventManager",
+    "EventMode",
     "EventTermCfg",
     "ManagerBase",
     "ManagerTermBase",

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
 
-@dataclass(kw_only=True)
+@dataclass
 class CurriculumTermCfg(ManagerTermBaseCfg):
     """A curriculum term: `func(env, env_ids, **params)` is called when environments reset.
 

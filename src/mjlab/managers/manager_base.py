@@ -42,7 +42,7 @@ class ManagerTermBaseCfg:
     """A function, or a class that is built with `(cfg, env)` and whose instance is then called.
     An instance with a `reset(env_ids)` method is reset with its environments."""
 
-    params: dict[str, Any] = field(default_factory=dict, kw_only=True)
+    params: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the call. Values that are `SceneEntityCfg` are resolved first."""
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
+from mjlab.compat import offers_older_attributes
 from mjlab.managers.env_ids import as_index, is_empty
 from mjlab.managers.finite_mean import finite_mean
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
@@ -30,6 +31,7 @@ class MetricsTermCfg(ManagerTermBaseCfg):
     """How the values of an episode's steps become one."""
 
 
+@offers_older_attributes
 class MetricsManager(TermListManager):
     """Collects the metrics of each episode. Values are neither weighted nor cleaned of NaN.
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.compat import offers_older_attributes
 from mjlab.managers.env_ids import is_empty
 from mjlab.managers.manager_base import ManagerBase
 from mjlab.managers.observation_checks import check_noise
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 Observation = torch.Tensor | dict[str, torch.Tensor]
 
 
+@offers_older_attributes
 class ObservationManager(ManagerBase):
     """Computes all observation groups; groups that are None or without terms are skipped.
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
 
-@dataclass(kw_only=True)
+@dataclass
 class ObservationTermCfg(ManagerTermBaseCfg):
     """A term of an observation group: `func(env, **params)` returns a tensor (num_envs, ...).
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
 
-@dataclass(kw_only=True)
+@dataclass
 class RecorderTermCfg(ManagerTermBaseCfg):
     """A recorder: `func` is a subclass of `RecorderTerm`, which is built with `(cfg, env)`."""
 

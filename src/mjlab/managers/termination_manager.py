@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.compat import offers_older_attributes
 from mjlab.managers.env_ids import as_index, is_empty
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
 
-@dataclass(kw_only=True)
+@dataclass
 class TerminationTermCfg(ManagerTermBaseCfg):
     """A reason to end an episode: `func(env, **params)` returns one bool for each environment."""
 
@@ -24,6 +25,7 @@ class TerminationTermCfg(ManagerTermBaseCfg):
     followed."""
 
 
+@offers_older_attributes
 class TerminationManager(TermListManager):
     """Decides which episodes end. All results are buffers that the next step overwrites."""
 

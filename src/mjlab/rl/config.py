@@ -74,7 +74,7 @@ class RslRlPpoAlgorithmCfg:
     """Optimizer."""
     share_cnn_encoders: bool = False
     """Whether actor and critic share their image encoders."""
-    symmetry_cfg: dict[str, Any] | None = None
+    symmetry_cfg: dict[str, Any] | None = field(default=None, kw_only=True)
     """Learning from mirror images too: `{"data_augmentation_func": "module:function",
     "use_data_augmentation": True}`, as rsl_rl has it. `mjlab.tasks.velocity.symmetry:mirror_left_right`
     is such a function. None: only what was seen."""

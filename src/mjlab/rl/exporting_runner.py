@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from mjlab.rl.runner import MjlabOnPolicyRunner
 
 
@@ -13,7 +11,7 @@ class ExportingOnPolicyRunner(MjlabOnPolicyRunner):
     exports_on_save = True
 
     def save(self, path: str, infos=None) -> None:
-        """Write a checkpoint, and the policy as `<folder>/<folder's name>.onnx` beside it.
+        """Write a checkpoint, and the policy where `_get_export_paths` says.
 
         The ONNX file carries what a deployment needs to know. An export that fails is logged, and
         training goes on.
@@ -27,5 +25,4 @@ class ExportingOnPolicyRunner(MjlabOnPolicyRunner):
         """
         super().save(path, infos)
         if self._writes:
-            folder = Path(path).resolve().parent
-            self.export_policy(str(folder / f"{folder.name}.onnx"))
+            self.export_policy(str(self._get_export_paths(path)[2]))

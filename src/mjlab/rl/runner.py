@@ -437,7 +437,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         path = os.path.join(self.logger.log_dir, name)
         self.save(path)
         if not self.exports_on_save:
-            self.export_policy()
+            self.export_policy(str(self._get_export_paths(path)[2]))
         self._tell("on_checkpoint", path)
 
     # Export.
@@ -457,7 +457,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         """Write the policy as ONNX with all that a deployment needs to know.
 
         Args:
-            path: The file; None: `<run folder>/<run folder's name>.onnx`.
+            path: The file; None: that of `_get_export_paths`.
 
         Returns:
             The file, or None if there is no run folder or the export failed. Failures are logged:
@@ -466,9 +466,10 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if path is None:
             if not self._writes or self.logger.log_dir is None:
                 return None
-            folder = Path(self.logger.log_dir)
-            path = str(folder / f"{folder.resolve().name}.onnx")
+            checkpoint = os.path.join(self.logger.log_dir, "model.pt")
+            path = str(self._get_export_paths(checkpoint)[2])
         target = Path(path)
+        target.parent.mkdir(parents=True, exist_ok=True)
         try:
             self.export_policy_to_onnx(str(target.parent), target.name)
         except Exception as error:
@@ -481,6 +482,16 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if self.cfg.get("upload_model", True):
             self.logger.save_model(path, max(self.current_learning_iteration - 1, 0))
         return path
+
+    @staticmethod
+    def _get_export_paths(checkpoint_path: str) -> tuple[Path, str, Path]:
+        """Return folder, file name and path of the policy exported beside a checkpoint.
+
+        `<folder>/<folder's name>.onnx`; subclasses override it to export elsewhere.
+        """
+        folder = Path(checkpoint_path).resolve().parent
+        name = f"{folder.name}.onnx"
+        return folder, name, folder / name
 
     def onnx_metadata(self) -> dict[str, Any]:
         """Return the metadata that `export_policy` writes; task runners add to it."""

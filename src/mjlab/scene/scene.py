@@ -42,7 +42,7 @@ EnvIds = torch.Tensor | slice | None
 TERRAIN = "terrain"
 
 
-@dataclass
+@dataclass(kw_only=True)
 class SceneCfg:
     """Describes what is in the world, and in how many environments."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from mjlab.compat import older_names
 from mjlab.scripts.cli import run_command
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def __getattr__(name: str) -> Any:
         from mjlab.scripts import csv_to_npz_run
 
         return getattr(csv_to_npz_run, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return older_names(__name__)(name)
 
 
 def _command(argv: list[str]) -> None:

@@ -91,7 +91,7 @@ def convert(cfg: CsvToNpzConfig) -> Path:
         f"at {cfg.output_fps:g} per second"
     )
     if cfg.render:
-        _record(motion, robot, path.with_suffix(".mp4"))
+        record_motion(motion, robot, path.with_suffix(".mp4"))
     if cfg.upload:
         _upload(path, name)
     if cfg.view:
@@ -154,7 +154,7 @@ def _stage(robot: Entity) -> mujoco.MjModel:
     return spec.compile()
 
 
-def _record(motion: Motion, robot: Entity, path: Path) -> None:
+def record_motion(motion: Motion, robot: Entity, path: Path) -> None:
     """Write a video of the motion."""
     import mujoco
 

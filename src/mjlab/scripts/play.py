@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from mjlab.compat import older_names
 from mjlab.scripts.cli import run_command, task_and_flags, task_usage
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def __getattr__(name: str) -> Any:
         from mjlab.scripts import play_run
 
         return getattr(play_run, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return older_names(__name__)(name)
 
 
 def _command(argv: list[str]) -> None:

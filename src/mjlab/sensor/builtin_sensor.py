@@ -65,7 +65,7 @@ class ObjRef:
         return f"{self.entity}/{self.name}" if self.entity else self.name
 
 
-@dataclass(kw_only=True)
+@dataclass
 class BuiltinSensorCfg(SensorCfg):
     """Describes a MuJoCo sensor to add to the scene.
 

@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 _DEFAULT_FOVY = 45.0
 
 
-@dataclass(kw_only=True)
+@dataclass
 class CameraSensorCfg(SensorCfg):
     """Describes a camera sensor."""
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import mujoco
 import torch
 
+from mjlab.compat import offers_older_attributes
 from mjlab.sensor._contact_clocks import ContactClocks
 from mjlab.sensor._contact_debug import draw_contacts
 from mjlab.sensor._contact_history import ContactHistory
@@ -64,7 +65,7 @@ class ContactMatch:
         return (self.pattern,) if isinstance(self.pattern, str) else tuple(self.pattern)
 
 
-@dataclass(kw_only=True)
+@dataclass
 class ContactSensorCfg(SensorCfg):
     """Describes a sensor of the contacts of some elements, with anything or with one other element.
 
@@ -177,6 +178,7 @@ class ContactData:
     """(N, P S, H) distance, likewise."""
 
 
+@offers_older_attributes
 class ContactSensor(Sensor[ContactData]):
     """Senses contacts by MuJoCo's contact sensors, on either engine.
 

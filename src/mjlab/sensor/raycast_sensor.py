@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import mujoco
 import torch
 
+from mjlab.compat import older_names
 from mjlab.sensor._frames import Frames, check_frames
 from mjlab.sensor._ray_alignment import RayAlignment, is_constant, rotate_into
 from mjlab.sensor._ray_data import RayCastData
@@ -42,7 +43,7 @@ __all__ = [
 NUM_GEOM_GROUPS = 6
 
 
-@dataclass(kw_only=True)
+@dataclass
 class RayCastSensorCfg(SensorCfg):
     """Describes a ray sensor."""
 
@@ -278,3 +279,6 @@ class RayCastSensor(Sensor[RayCastData]):
             "distances": data.distances,
         }
         draw_rays(visualizer, self.cfg.name, self.cfg.viz, self.cfg.max_distance, rays)
+
+
+__getattr__ = older_names(__name__)

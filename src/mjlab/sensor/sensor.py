@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-@dataclass(kw_only=True)
+@dataclass
 class SensorCfg(ABC):
     """Describes a sensor."""
 

@@ -14,7 +14,7 @@ from mjlab.sensor.raycast_sensor import RayCastData, RayCastSensor, RayCastSenso
 REDUCTIONS = ("min", "max", "mean", "none")
 
 
-@dataclass(kw_only=True)
+@dataclass
 class TerrainHeightSensorCfg(RayCastSensorCfg):
     """Describes a sensor of heights above the ground."""
 

@@ -112,7 +112,7 @@ def _enum_value(mujoco: Any, option: str, enum_name: str, prefix: str, name: str
     return members[name]
 
 
-@dataclass
+@dataclass(kw_only=True)
 class SimulationCfg:
     """Which engine runs the physics, and how."""
 

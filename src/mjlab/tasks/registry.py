@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
+from mjlab.compat import older_names
+
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
     from mjlab.rl.config import RslRlBaseRunnerCfg
@@ -288,3 +290,6 @@ def _missing_extra(error: BaseException) -> str:
                 )
         cause = cause.__cause__ or cause.__context__
     return ""
+
+
+__getattr__ = older_names(__name__)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from mjlab.compat import older_names
 from mjlab.terrains._field_obstacles import (
     HfDiscreteObstaclesTerrainCfg as HfDiscreteObstaclesTerrainCfg,
 )
@@ -249,3 +250,6 @@ class HfPerlinNoiseTerrainCfg(SubTerrainCfg):
         surface = pixels.with_border(noise) * height
         field = add_heightfield(spec, self.size, surface, self.base_thickness_ratio, height)
         return finish(self, field, field.highest_near_centre(), rng, pixel=self.resolution)
+
+
+__getattr__ = older_names(__name__)

@@ -19,7 +19,7 @@ class OriginType(enum.Enum):
     """The body `body_name` of `entity_name`, followed as it moves."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class ViewerConfig:
     """Camera, image size and visibility, shared by all viewers."""
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import torch
 
+from mjlab.compat.older import reward_weight
 from mjlab.envs.mdp import curriculums
-from mjlab.envs.mdp.older_curriculums import reward_weight
 from mjlab.managers.curriculum_manager import CurriculumTermCfg
 from mjlab.managers.reward_manager import RewardTermCfg
 from mjlab.managers.termination_manager import TerminationTermCfg

@@ -468,3 +468,16 @@ def test_the_config_is_left_as_it_was(make_env):
     env.reset()
     env.close()
     assert vars(cfg.commands["motion"]) == before
+
+
+@pytest.mark.parametrize("mode", ["adaptive", "uniform"])
+def test_bins_and_anchors_are_told_under_the_names_of_the_interface(make_env, short, mode):
+    command = command_of(make_env(short, num_envs=1, sampling_mode=mode))
+    assert command.bin_failed_count.shape == (command.bin_count,)
+    assert not command.bin_failed_count.any()
+    if mode == "adaptive":
+        command.sampler.failed[-1] = 0.5
+        assert command.bin_failed_count[-1] == 0.5
+    name = command.cfg.anchor_body_name
+    assert command.cfg.body_names[command.motion_anchor_body_index] == name
+    assert command.robot.body_names[command.robot_anchor_body_index] == name

@@ -83,7 +83,7 @@ def reset_root_state_uniform(
     """
     ids = resolve_env_ids(env, env_ids)
     asset: Entity = env.scene[asset_cfg.name]
-    pose = _sample_se3(pose_range, len(ids), env.device)
+    pose = _sample_se3_range(pose_range, (len(ids), 6), env.device)
     position = pose[:, :3]
     position += asset.data.default_root_state[ids, :3]
     position += env.scene.env_origins[ids]
@@ -119,7 +119,7 @@ def reset_root_state_from_flat_patches(
     asset: Entity = env.scene[asset_cfg.name]
     picks = torch.randint(patches.shape[2], (len(ids),), device=env.device)
     patch = patches[levels[ids], types[ids], picks]
-    pose = _sample_se3(pose_range, len(ids), env.device)
+    pose = _sample_se3_range(pose_range, (len(ids), 6), env.device)
     pose[:, :3] += patch
     pose[:, 2] += asset.data.default_root_state[ids, 2]
     _write_root(asset, asset_cfg.name, ids, pose, velocity_range)
@@ -171,7 +171,7 @@ def push_by_setting_velocity(
             f"push_by_setting_velocity: entity {asset_cfg.name!r} has a fixed base, which has no "
             "velocity to change. Select an entity with a free joint."
         )
-    change = _sample_se3(velocity_range, len(ids), env.device)
+    change = _sample_se3_range(velocity_range, (len(ids), 6), env.device)
     indexing, sim_data = asset.data.indexing, env.sim.data
     # The angular part of a free joint's velocity is in the body's frame.
     quat = sim_data.qpos[ids[:, None], indexing.free_joint_q_adr[3:7]]
@@ -205,13 +205,16 @@ def _is_mocap(entity: Entity) -> bool:
     return entity.data.indexing.mocap_id is not None
 
 
-def _sample_se3(ranges: Se3Ranges, count: int, device: str) -> torch.Tensor:
-    """Draw (count, 6) in the order of the keys; all six are drawn, whichever are given."""
+def _sample_se3_range(
+    range_dict: Se3Ranges | None, shape: tuple[int, ...], device: str
+) -> torch.Tensor:
+    """Draw (..., 6) in the order of the keys; all six are drawn, whichever are given."""
+    ranges = range_dict or {}
     unknown = [key for key in ranges if key not in _SE3_KEYS]
     if unknown:
         raise ValueError(f"Ranges have unknown keys {unknown}; the keys are {list(_SE3_KEYS)}.")
     bounds = torch.tensor([ranges.get(key, (0.0, 0.0)) for key in _SE3_KEYS], device=device)
-    return sample_uniform(bounds[:, 0], bounds[:, 1], (count, 6), device)
+    return sample_uniform(bounds[:, 0], bounds[:, 1], shape, device)
 
 
 def _write_root(
@@ -233,7 +236,7 @@ def _write_root(
             f"The root of entity {name!r} is fixed and no mocap body, so its pose cannot be reset. "
             "Select an entity with a free joint or a mocap base."
         )
-    velocity = _sample_se3(velocity_range or {}, len(ids), str(ids.device))
+    velocity = _sample_se3_range(velocity_range, (len(ids), 6), str(ids.device))
     velocity += default[:, 7:13]
     # The pose comes first: writing the velocity rotates its angular part into the body's frame.
     asset.write_root_link_pose_to_sim(root_pose, env_ids=ids)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from mjlab.compat import older_names
 from mjlab.envs.mdp._indexing import columns
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.sensor.builtin_sensor import BuiltinSensor
@@ -142,3 +143,6 @@ def _builtin(env: ManagerBasedRlEnv, sensor_name: str) -> BuiltinSensor:
             "a MuJoCo sensor, such as 'robot/imu_gyro'."
         )
     return sensor
+
+
+__getattr__ = older_names(__name__)

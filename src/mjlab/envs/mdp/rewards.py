@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from mjlab.compat import older_names
 from mjlab.envs.mdp._indexing import columns
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.utils.lab_api.string import resolve_matching_names_values
@@ -142,3 +143,6 @@ class electrical_power_cost:
         joints = columns(asset_cfg.joint_ids, env.device)
         power = asset.data.qfrc_actuator[:, joints] * asset.data.joint_vel[:, joints]
         return power.clamp_(min=0.0).sum(dim=1)
+
+
+__getattr__ = older_names(__name__)

@@ -27,7 +27,7 @@ from mjlab.viewer import ViewerConfig
 # Filled in by the robot.
 _NO_NAMES: tuple[str, ...] = ()
 
-_VELOCITIES = {
+VELOCITY_RANGE = {
     "x": (-0.5, 0.5),
     "y": (-0.5, 0.5),
     "z": (-0.2, 0.2),
@@ -35,6 +35,7 @@ _VELOCITIES = {
     "pitch": (-0.52, 0.52),
     "yaw": (-0.78, 0.78),
 }
+"""Perturbation of the root's velocity, by pushes and at starts (m/s, rad/s)."""
 
 
 def make_tracking_env_cfg() -> ManagerBasedRlEnvCfg:
@@ -155,7 +156,7 @@ def _commands() -> dict[str, CommandTermCfg | None]:
                 "pitch": (-0.1, 0.1),
                 "yaw": (-0.2, 0.2),
             },
-            velocity_range=dict(_VELOCITIES),
+            velocity_range=dict(VELOCITY_RANGE),
             joint_position_range=(-0.1, 0.1),
         )
     }
@@ -167,7 +168,7 @@ def _events() -> dict[str, EventTermCfg | None]:
             func=mdp.push_by_setting_velocity,
             mode="interval",
             interval_range_s=(1.0, 3.0),
-            params={"velocity_range": dict(_VELOCITIES)},
+            params={"velocity_range": dict(VELOCITY_RANGE)},
         ),
         "base_com": EventTermCfg(
             func=mdp.dr.body_com_offset,

@@ -44,6 +44,11 @@ from mjlab.utils.lab_api._poses import (
     transform_poses_from_frame_A_to_frame_B,
     unmake_pose,
 )
+from mjlab.utils.lab_api._projection import (
+    orthogonalize_perspective_depth,
+    project_points,
+    unproject_depth,
+)
 from mjlab.utils.lab_api._quaternions import (
     axis_angle_from_quat,
     quat_apply,
@@ -94,8 +99,10 @@ __all__ = [
     "matrix_from_euler",
     "matrix_from_quat",
     "normalize",
+    "orthogonalize_perspective_depth",
     "pose_in_A_to_pose_in_B",
     "pose_inv",
+    "project_points",
     "quat_apply",
     "quat_apply_inverse",
     "quat_apply_yaw",
@@ -127,6 +134,7 @@ __all__ = [
     "transform_points",
     "transform_poses_from_frame_A_to_frame_B",
     "unmake_pose",
+    "unproject_depth",
     "unscale_transform",
     "wrap_to_pi",
     "yaw_quat",

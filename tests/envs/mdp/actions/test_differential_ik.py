@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from mjlab.actuator import BuiltinPositionActuatorCfg
 from mjlab.asset_zoo.robots import get_yam_robot_cfg
 from mjlab.entity import EntityCfg
-from mjlab.envs.mdp import DifferentialIKActionCfg
+from mjlab.envs.mdp import DifferentialIKAction, DifferentialIKActionCfg
 from mjlab.utils.damped_least_squares import damped_least_squares
 from mjlab.utils.lab_api.math import (
     compute_pose_error,
@@ -200,14 +200,14 @@ def test_the_jacobian_is_that_of_finite_differences(arm: Any, kind: str, name: s
     ik = term(arm, frame_type=kind, frame_name=name, damping=0.0)
     sim, step = arm.sim, 1e-2
     start = sim.data.qpos.clone()
-    jacobians = sim.jacobian(ik._frame_pose()[0], ik._body_ids)
+    jacobians = sim.jacobian(ik._get_frame_pose()[0], ik._body_ids)
     for joint in range(6):
         poses = []
         for sign in (-1.0, 1.0):
             sim.data.qpos[:] = start
             sim.data.qpos[:, joint] += sign * step
             sim.forward()
-            poses.append([part.clone() for part in ik._frame_pose()])
+            poses.append([part.clone() for part in ik._get_frame_pose()])
         shift, turn = compute_pose_error(*poses[0], *poses[1])
         for jacobian, difference in zip(jacobians, (shift, turn), strict=True):
             torch.testing.assert_close(
@@ -219,7 +219,7 @@ def test_the_jacobian_is_that_of_finite_differences(arm: Any, kind: str, name: s
 def test_pose_and_jacobian_are_of_the_same_moment(make_world: Any, engine: str) -> None:
     arm = make_arm(make_world, engine=engine)
     ik = term(arm)
-    before = [part.clone() for part in arm.sim.jacobian(ik._frame_pose()[0], ik._body_ids)]
+    before = [part.clone() for part in arm.sim.jacobian(ik._get_frame_pose()[0], ik._body_ids)]
     position = pose(arm)[0]
     arm.sim.data.qvel[:] = 3.0
     arm.sim.step(1)
@@ -602,3 +602,30 @@ def test_the_scale_of_earlier_releases_scales_both_parts() -> None:
             entity_name="robot", actuator_names=(".*",), frame_name="hand", **older
         )
     assert (cfg.delta_pos_scale, cfg.delta_ori_scale) == (0.05, 0.5)
+
+
+@pytest.mark.filterwarnings("ignore:.*older:FutureWarning")
+def test_joint_ids_are_those_of_the_entity(arm: Any) -> None:
+    assert term(arm, ("j2", "j5"))._joint_ids.tolist() == [1, 4]
+    assert term(arm)._joint_ids.tolist() == list(range(6))
+
+
+def test_a_subclass_may_say_where_the_frame_is(arm: Any) -> None:
+    class Tool(DifferentialIKAction):
+        def _get_frame_pose(self) -> tuple[torch.Tensor, torch.Tensor]:
+            position, quat = super()._get_frame_pose()
+            return position + torch.tensor([0.0, 0.0, 0.1]), quat
+
+    cfg = DifferentialIKActionCfg(
+        entity_name="robot", actuator_names=(".*",), frame_type="site", frame_name="grasp"
+    )
+    plain, tool = DifferentialIKAction(cfg, arm), Tool(cfg, arm)
+    for ik in (plain, tool):
+        act(ik, torch.zeros(6))
+    torch.testing.assert_close(
+        tool._desired_pos - plain._desired_pos, torch.tensor([[0.0, 0.0, 0.1]]).expand(NUM_ENVS, 3)
+    )
+    # Where the frame is asked to be elsewhere, the error is that of the tool's point.
+    plain._desired_pos.copy_(tool._desired_pos)
+    assert not tool.compute_dq().abs().gt(1e-3).any()
+    assert plain.compute_dq().abs().gt(1e-3).any()

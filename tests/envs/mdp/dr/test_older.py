@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from mjlab.actuator import BuiltinPositionActuatorCfg
+from mjlab.compat import older
 from mjlab.envs import mdp
-from mjlab.envs.mdp.dr import older
 from mjlab.managers.event_manager import EventTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 

@@ -44,11 +44,11 @@ ARMATURE_DM_4340 = 0.032
 ARMATURE_DM_4310 = 0.0018
 """Inertia of the motors of joints 4 to 6 and of the gripper, kg m^2."""
 
-ACTUATOR_DM_4340 = ElectricActuator(
+DM_4340 = ElectricActuator(
     reflected_inertia=ARMATURE_DM_4340, velocity_limit=10.0, effort_limit=28.0
 )
 """The motor of joints 1 to 3."""
-ACTUATOR_DM_4310 = ElectricActuator(
+DM_4310 = ElectricActuator(
     reflected_inertia=ARMATURE_DM_4310, velocity_limit=30.0, effort_limit=10.0
 )
 """The motor of joints 4 to 6, and of the gripper before its crank."""
@@ -66,9 +66,9 @@ GRIPPER_TRANSMISSION_RATIO_CRANK = GRIPPER_LINEAR_STROKE_CRANK / GRIPPER_MOTOR_S
     VELOCITY_LIMIT_DM_4310_LINEAR_CRANK,
     EFFORT_LIMIT_DM_4310_LINEAR_CRANK,
 ) = reflect_rotary_to_linear(
-    ACTUATOR_DM_4310.reflected_inertia,
-    ACTUATOR_DM_4310.velocity_limit,
-    ACTUATOR_DM_4310.effort_limit,
+    DM_4310.reflected_inertia,
+    DM_4310.velocity_limit,
+    DM_4310.effort_limit,
     GRIPPER_TRANSMISSION_RATIO_CRANK,
 )
 """The motor as the fingers see it: kg, m/s and N."""
@@ -109,11 +109,11 @@ def _joint_actuator(joint: str, motor: ElectricActuator) -> BuiltinPositionActua
 
 
 ARM_ACTUATORS = (
-    *(_joint_actuator(f"joint{number}", ACTUATOR_DM_4340) for number in (1, 2, 3)),
-    *(_joint_actuator(f"joint{number}", ACTUATOR_DM_4310) for number in (4, 5, 6)),
+    *(_joint_actuator(f"joint{number}", DM_4340) for number in (1, 2, 3)),
+    *(_joint_actuator(f"joint{number}", DM_4310) for number in (4, 5, 6)),
 )
 """Actuators of the arm, one for each joint."""
-GRIPPER_ACTUATOR = BuiltinPositionActuatorCfg(
+ACTUATOR_DM_4310_LINEAR_CRANK = BuiltinPositionActuatorCfg(
     target_names_expr=("left_finger",),
     stiffness=STIFFNESS_GRIPPER,
     damping=DAMPING_GRIPPER,
@@ -122,11 +122,11 @@ GRIPPER_ACTUATOR = BuiltinPositionActuatorCfg(
 )
 """Actuator of the gripper, at the left finger."""
 ARTICULATION = EntityArticulationInfoCfg(
-    actuators=(*ARM_ACTUATORS, GRIPPER_ACTUATOR), soft_joint_pos_limit_factor=0.9
+    actuators=(*ARM_ACTUATORS, ACTUATOR_DM_4310_LINEAR_CRANK), soft_joint_pos_limit_factor=0.9
 )
 """All actuators."""
 
-YAM_ACTION_SCALE = action_scale((*ARM_ACTUATORS, GRIPPER_ACTUATOR))
+YAM_ACTION_SCALE = action_scale((*ARM_ACTUATORS, ACTUATOR_DM_4310_LINEAR_CRANK))
 """Scale of joint position actions by joint, rad per unit of action (the finger: m)."""
 
 # The pose to start from.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import torch
 
-from mjlab.compat import accepts_older_fields
+from mjlab.compat import accepts_older_fields, offers_older_attributes, older_names
 from mjlab.envs.mdp._indexing import columns
 from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
 from mjlab.utils.damped_least_squares import damped_least_squares
@@ -94,6 +94,7 @@ class DifferentialIKActionCfg(ActionTermCfg):
         return DifferentialIKAction(self, env)
 
 
+@offers_older_attributes
 class DifferentialIKAction(ActionTerm):
     """Commands the pose of a frame; joint position targets follow it at every physics substep.
 
@@ -109,7 +110,6 @@ class DifferentialIKAction(ActionTerm):
 
     # What follows from the config and views of the simulation are no run-time state.
     _transient = {
-        "_joint_ids",
         "_columns",
         "_dofs",
         "_body_ids",
@@ -154,7 +154,7 @@ class DifferentialIKAction(ActionTerm):
     def process_actions(self, actions: torch.Tensor) -> None:
         """Set the pose to reach, from the frame's present one; actions are (N, action_dim)."""
         self._raw_actions.copy_(actions)
-        cfg, (position, quat) = self.cfg, self._frame_pose()
+        cfg, (position, quat) = self.cfg, self._get_frame_pose()
         if cfg.use_relative_mode:
             delta = (self._raw_actions * self._scale).clamp_(-_FARTHEST, _FARTHEST)
             position = position + delta[:, :3]
@@ -227,7 +227,7 @@ class DifferentialIKAction(ActionTerm):
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return the arguments of `damped_least_squares`; `low` and `high` are the way to limits."""
         cfg = self.cfg
-        position, quat = self._frame_pose()
+        position, quat = self._get_frame_pose()
         errors = compute_pose_error(position, quat, self._desired_pos, self._desired_quat)
         jacobians = self._env.sim.jacobian(position, self._body_ids)
         weights = (cfg.position_weight, cfg.orientation_weight)
@@ -240,7 +240,11 @@ class DifferentialIKAction(ActionTerm):
         stiffness = limit * (outside != 0.0) + (posture + damping)
         return jacobian, error, stiffness, limit * outside + posture * (self._posture - q)
 
-    def _frame_pose(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def _get_frame_pose(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return position (N, 3) and quaternion (N, 4) of the frame in the world.
+
+        Subclasses override it for a frame of their own; the point moves with the body.
+        """
         if self.cfg.frame_type == "body":
             return self._frame_pos, self._frame_rotation
         return self._frame_pos, quat_from_matrix(self._frame_rotation)
@@ -292,3 +296,6 @@ def _check_cfg(cfg: DifferentialIKActionCfg) -> None:
             "position_weight and orientation_weight are both 0, so that the frame is free to be "
             "anywhere. Give at least one of them a positive weight."
         )
+
+
+__getattr__ = older_names(__name__)

@@ -7,6 +7,7 @@ copy per environment, and derived constants are recomputed.
 from __future__ import annotations
 
 from mjlab.compat import older_names
+from mjlab.envs.mdp.dr import _types
 from mjlab.envs.mdp.dr._types import Distribution, Operation
 from mjlab.envs.mdp.dr.actuator import effort_limits, pd_gains
 from mjlab.envs.mdp.dr.body import (
@@ -136,5 +137,9 @@ __all__ = [
     "tendon_frictionloss",
     "tendon_stiffness",
 ]
+
+# Operations and distributions as objects. `__all__` is without them: `abs` is also a builtin.
+abs, add, scale = _types.ABS, _types.ADD, _types.SCALE
+uniform, log_uniform, gaussian = _types.UNIFORM, _types.LOG_UNIFORM, _types.GAUSSIAN
 
 __getattr__ = older_names(__name__)

@@ -85,14 +85,11 @@ def _check_deviation(mean: float, deviation: float) -> None:
         )
 
 
-DISTRIBUTIONS = {
-    d.name: d
-    for d in (
-        Distribution("uniform", _uniform),
-        Distribution("log_uniform", _log_uniform, _check_log_bounds),
-        Distribution("gaussian", _gaussian, _check_deviation),
-    )
-}
+UNIFORM = Distribution("uniform", _uniform)
+LOG_UNIFORM = Distribution("log_uniform", _log_uniform, _check_log_bounds)
+GAUSSIAN = Distribution("gaussian", _gaussian, _check_deviation)
+
+DISTRIBUTIONS = {d.name: d for d in (UNIFORM, LOG_UNIFORM, GAUSSIAN)}
 
 ABS = Operation("abs", torch.clone, lambda base, rnd: rnd, uses_defaults=False)
 SCALE = Operation("scale", torch.ones_like, lambda base, rnd: base * rnd, uses_defaults=True)

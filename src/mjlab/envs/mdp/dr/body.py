@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mjlab.compat import older_names
 from mjlab.envs.mdp.dr._terms import field_term, rotation_term
 from mjlab.envs.mdp.dr.inertia import pseudo_inertia
 
@@ -21,3 +22,6 @@ body_quat = rotation_term("body_quat")
 
 # MuJoCo's own name of the field.
 body_ipos = body_com_offset
+
+
+__getattr__ = older_names(__name__)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.compat import older_names
 from mjlab.envs.mdp._checks import require_command
 from mjlab.envs.mdp._indexing import columns
 from mjlab.managers.build_checks import checked_when_built
@@ -130,3 +131,6 @@ def ee_velocity(
     sites = columns(asset_cfg.site_ids, env.device)
     velocity = asset.data.site_lin_vel_w[:, sites].squeeze(1)
     return quat_apply_inverse(site_quat(env, asset_cfg), velocity)
+
+
+__getattr__ = older_names(__name__)

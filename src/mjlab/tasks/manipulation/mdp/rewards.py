@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.compat import older_names
 from mjlab.envs.mdp._indexing import columns
 from mjlab.managers.build_checks import checked_when_built
 from mjlab.managers.scene_entity_config import SceneEntityCfg
@@ -116,3 +117,6 @@ def _staged(
 
 def _closeness(one: torch.Tensor, other: torch.Tensor, std: float) -> torch.Tensor:
     return torch.exp((one - other).square().sum(dim=1) / -(std**2))
+
+
+__getattr__ = older_names(__name__)

@@ -1,3 +1,6 @@
 """Termination terms of the manipulation tasks. Each returns bool (N,)."""
 
+from mjlab.compat import older_names
 from mjlab.envs.mdp.terminations import illegal_contact as illegal_contact
+
+__getattr__ = older_names(__name__)

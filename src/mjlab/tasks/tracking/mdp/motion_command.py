@@ -174,6 +174,28 @@ class MotionCommand(MotionReader, CommandTerm):
         return torch.cat((self.joint_pos, self.joint_vel), dim=1)
 
     @property
+    def motion_anchor_body_index(self) -> int:
+        """Index of the anchor within `body_names`."""
+        return self.anchor_index
+
+    @property
+    def robot_anchor_body_index(self) -> int:
+        """Index of the anchor within the robot's bodies."""
+        return self.anchor_body
+
+    @property
+    def bin_count(self) -> int:
+        """Number of bins, of about a second each, that all motions are cut into."""
+        return self._num_bins
+
+    @property
+    def bin_failed_count(self) -> torch.Tensor:
+        """Running mean of the failures in each bin, (bin_count,). Zeros unless sampling is adaptive."""
+        if self.sampler is None:
+            return torch.zeros(self._num_bins, device=self.device)
+        return self.sampler.failed
+
+    @property
     def frame_indexes(self) -> torch.Tensor:
         """(N,) int64, the frame of each environment, counted over all motions."""
         return self._counted_over_all(self.time_steps)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from mjlab.compat import older_names
 from mjlab.managers.build_checks import checked_when_built
 from mjlab.tasks.tracking.mdp._shared import check_motion_term, motion_command
 from mjlab.utils.lab_api.math import quat_apply_inverse, quat_inv, quat_mul
@@ -61,3 +62,6 @@ def _two_columns(quat: torch.Tensor) -> torch.Tensor:
     yy, xx, zz = y * y, x * x, z * z
     rows = (0.5 - yy - zz, xy - wz, xy + wz, 0.5 - xx - zz, xz - wy, yz + wx)
     return torch.stack(rows, dim=-1).mul_(2.0)
+
+
+__getattr__ = older_names(__name__)

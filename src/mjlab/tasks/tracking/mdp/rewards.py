@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from mjlab.compat import older_names
 from mjlab.managers.build_checks import checked_when_built
 from mjlab.tasks.tracking.mdp._shared import body_columns, check_motion_term, motion_command
 from mjlab.tasks.velocity.mdp.rewards import self_collision_cost as self_collision_cost
@@ -83,3 +84,6 @@ def motion_global_body_angular_velocity_error_exp(
 def _rewarded(errors: torch.Tensor, columns: slice | torch.Tensor, std: float) -> torch.Tensor:
     """Return exp(-mean / std^2) of squared errors (N, K) over the chosen bodies."""
     return torch.exp(errors[:, columns].mean(dim=-1) / -(std**2))
+
+
+__getattr__ = older_names(__name__)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from mjlab.compat import older_names
 from mjlab.managers.build_checks import checked_when_built
 from mjlab.tasks.tracking.mdp._shared import body_columns, check_motion_term, motion_command
 from mjlab.utils.lab_api.math import quat_apply_inverse
@@ -82,3 +83,6 @@ def motion_ended(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     """
     command = motion_command(env, command_name)
     return command.time_steps >= command.motion.lengths[command.motion_ids] - 1
+
+
+__getattr__ = older_names(__name__)

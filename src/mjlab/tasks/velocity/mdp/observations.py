@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from mjlab.compat import older_names
 from mjlab.managers.build_checks import checked_when_built
 from mjlab.tasks.velocity.mdp.sensor_checks import (
     check_air_time_sensor,
@@ -44,3 +45,6 @@ def foot_contact_forces(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tenso
     """
     force = env.scene[sensor_name].data.force.flatten(start_dim=1)
     return torch.copysign(torch.log1p(force.abs()), force)
+
+
+__getattr__ = older_names(__name__)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from mjlab.compat import older_names
 from mjlab.envs.mdp.terminations import illegal_contact as illegal_contact
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 
@@ -58,3 +59,6 @@ def terrain_edge_reached(
     reached_x = offset[:, 0] > size_x / 2.0 * threshold_fraction
     reached_y = offset[:, 1] > size_y / 2.0 * threshold_fraction
     return (reached_x | reached_y) & (env.episode_length_buf > _MIN_STEPS)
+
+
+__getattr__ = older_names(__name__)

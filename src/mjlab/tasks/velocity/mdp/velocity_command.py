@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.env_ids import as_ids, is_empty
 from mjlab.tasks.velocity.mdp.command_checks import RANGES, check_command_cfg
@@ -318,3 +319,6 @@ def _rotated(vector: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
     cos, sin = torch.cos(angle), torch.sin(angle)
     x, y = vector[:, 0], vector[:, 1]
     return torch.stack((cos * x - sin * y, sin * x + cos * y), dim=1)
+
+
+__getattr__ = older_names(__name__)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from mjlab.asset_zoo.robots import get_go1_robot_cfg
 from mjlab.asset_zoo.robots.unitree_go1.go1_constants import GO1_ACTION_SCALE
 from mjlab.envs import ManagerBasedRlEnvCfg
@@ -15,6 +17,9 @@ from mjlab.tasks.velocity.variants import (
     remove_sensors,
 )
 from mjlab.tasks.velocity.velocity_env_cfg import make_velocity_env_cfg
+
+TerrainType = Literal["rough", "obstacles"]
+"""Terrain of a task that does not walk on flat ground."""
 
 _TRUNK = "trunk"
 # In the order of the model, as contacts and sites are.

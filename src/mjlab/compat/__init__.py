@@ -3,9 +3,13 @@
 Task packages in the field were written against any release from 1.1 to 1.6. What a later release
 renamed, dropped or made stricter still works: a module that once offered more names ends with
 `__getattr__ = older_names(__name__)`, and a config class that once took more fields, or demanded
-fewer, carries `@accepts_older_fields`. Each use warns once, naming today's spelling.
+fewer, carries `@accepts_older_fields`.
 
-Nothing is imported before an older name is asked for.
+Deprecation policy: each use warns once, naming today's spelling, and all of it stays through 1.x
+and is removed in 2.0.
+
+Nothing is imported before an older name is asked for. Names without a successor are in
+`mjlab.compat.older`.
 """
 
 from __future__ import annotations
@@ -14,10 +18,8 @@ import dataclasses
 import functools
 import importlib
 import inspect
-import time
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, TypeVar
 
 C = TypeVar("C", bound=type)
@@ -25,15 +27,15 @@ C = TypeVar("C", bound=type)
 # Where an older name lives today, as "module:name".
 _EVENTS = {
     "EntityIndexing": "mjlab.entity:EntityIndexing",
-    "FieldSpec": "mjlab.envs.mdp.dr.older:FieldSpec",
+    "FieldSpec": "mjlab.compat.older:FieldSpec",
     "randomize_effort_limits": "mjlab.envs.mdp.dr:effort_limits",
     "randomize_encoder_bias": "mjlab.envs.mdp.dr:encoder_bias",
-    "randomize_field": "mjlab.envs.mdp.dr.older:randomize_field",
+    "randomize_field": "mjlab.compat.older:randomize_field",
     "randomize_pd_gains": "mjlab.envs.mdp.dr:pd_gains",
     "requires_model_fields": "mjlab.managers.event_manager:requires_model_fields",
     "sample_gaussian": "mjlab.utils.lab_api.math:sample_gaussian",
     "sample_log_uniform": "mjlab.utils.lab_api.math:sample_log_uniform",
-    "sync_actuator_delays": "mjlab.envs.mdp.dr.older:sync_actuator_delays",
+    "sync_actuator_delays": "mjlab.compat.older:sync_actuator_delays",
 }
 _XML_ACTUATORS = {
     f"Xml{kind}Actuator{suffix}": f"mjlab.actuator.xml_actuator:XmlActuator{suffix}"
@@ -41,18 +43,17 @@ _XML_ACTUATORS = {
     for suffix in ("", "Cfg")
 }
 _DELAYED_ACTUATORS = {
-    name: f"mjlab.actuator.older:{name}" for name in ("DelayedActuator", "DelayedActuatorCfg")
+    name: f"mjlab.compat.older:{name}" for name in ("DelayedActuator", "DelayedActuatorCfg")
 }
 _REWARD_WEIGHT = {
-    name: f"mjlab.envs.mdp.older_curriculums:{name}"
-    for name in ("RewardWeightStage", "reward_weight")
+    name: f"mjlab.compat.older:{name}" for name in ("RewardWeightStage", "reward_weight")
 }
-_FLAT_ORIENTATION = {"flat_orientation": "mjlab.tasks.velocity.mdp.older:flat_orientation"}
+_FLAT_ORIENTATION = {"flat_orientation": "mjlab.compat.older:flat_orientation"}
 _TERRAIN_IMPORTER = {
     "TerrainImporter": "mjlab.terrains.terrain_entity:TerrainEntity",
     "TerrainImporterCfg": "mjlab.terrains.terrain_entity:TerrainEntityCfg",
 }
-_ROBOT_FILES = {"get_assets": "mjlab.compat:get_assets"}
+_ROBOT_FILES = {"get_assets": "mjlab.compat.older:get_assets"}
 _VISER = {
     name: f"mjviser.conversions:{name}"
     for name in (
@@ -69,7 +70,87 @@ _VISER = {
         "rotation_matrix_from_vectors",
     )
 }
-_VISER["rotation_quat_from_vectors"] = "mjlab.compat:rotation_quat_from_vectors"
+_VISER["rotation_quat_from_vectors"] = "mjlab.compat.older:rotation_quat_from_vectors"
+
+# Names that modules of 1.6 imported for their own use, and packages import from there.
+_MATH = "mjlab.utils.lab_api.math"
+_HOMES = {
+    "BuiltinSensor": "mjlab.sensor",
+    "CameraSensor": "mjlab.sensor",
+    "CommandTerm": "mjlab.managers",
+    "CommandTermCfg": "mjlab.managers",
+    "ContactSensor": "mjlab.sensor",
+    "DebugVisualizer": "mjlab.viewer.debug_visualizer",
+    "Entity": "mjlab.entity",
+    "LiftingCommand": "mjlab.tasks.manipulation.mdp.commands",
+    "MJLAB_SRC_PATH": "mjlab",
+    "ManagerBasedRlEnv": "mjlab.envs",
+    "MjlabOnPolicyRunner": "mjlab.rl",
+    "MotionCommand": "mjlab.tasks.tracking.mdp.commands",
+    "MotionCommandCfg": "mjlab.tasks.tracking.mdp.commands",
+    "MultiCubeLiftingCommand": "mjlab.tasks.manipulation.mdp.commands",
+    "RayCastSensor": "mjlab.sensor",
+    "RewardTermCfg": "mjlab.managers",
+    "RslRlVecEnvWrapper": "mjlab.rl",
+    "TerrainHeightSensor": "mjlab.sensor",
+    "UniformVelocityCommandCfg": "mjlab.tasks.velocity.mdp",
+    "VideoRecorder": "mjlab.utils.wrappers",
+    "get_checkpoint_path": "mjlab.utils.os",
+    "get_wandb_checkpoint_path": "mjlab.utils.os",
+    "list_tasks": "mjlab.tasks.registry",
+    "load_env_cfg": "mjlab.tasks.registry",
+    "load_rl_cfg": "mjlab.tasks.registry",
+    "load_runner_cls": "mjlab.tasks.registry",
+}
+_SCRIPTS = (
+    "ManagerBasedRlEnv MjlabOnPolicyRunner MotionCommandCfg RslRlVecEnvWrapper VideoRecorder "
+    "get_wandb_checkpoint_path list_tasks load_env_cfg load_rl_cfg load_runner_cls"
+)
+_TRACKING = (
+    "matrix_from_quat quat_apply quat_error_magnitude quat_from_euler_xyz quat_inv quat_mul "
+    "sample_uniform yaw_quat"
+)
+_PASSED_THROUGH = {
+    "mjlab.asset_zoo.robots.i2rt_yam.yam_constants": "MJLAB_SRC_PATH",
+    "mjlab.asset_zoo.robots.unitree_g1.g1_constants": "MJLAB_SRC_PATH",
+    "mjlab.asset_zoo.robots.unitree_go1.go1_constants": "MJLAB_SRC_PATH",
+    "mjlab.entity.data": "quat_apply quat_apply_inverse quat_from_matrix quat_mul",
+    "mjlab.envs.mdp": "quat_apply quat_from_euler_xyz quat_mul",
+    "mjlab.envs.mdp.actions.differential_ik": "apply_delta_pose",
+    "mjlab.envs.mdp.dr.body": "matrix_from_quat quat_from_matrix",
+    "mjlab.envs.mdp.events": "Entity quat_apply",
+    "mjlab.envs.mdp.observations": "Entity RayCastSensor",
+    "mjlab.envs.mdp.rewards": "Entity RewardTermCfg",
+    "mjlab.scripts.play": _SCRIPTS,
+    "mjlab.scripts.train": f"{_SCRIPTS} get_checkpoint_path",
+    "mjlab.sensor.raycast_sensor": "quat_from_matrix",
+    "mjlab.tasks.manipulation.mdp": "quat_apply quat_from_euler_xyz quat_inv quat_mul",
+    "mjlab.tasks.manipulation.mdp.commands": (
+        "CommandTerm CommandTermCfg Entity quat_from_euler_xyz sample_uniform"
+    ),
+    "mjlab.tasks.manipulation.mdp.observations": (
+        "CameraSensor Entity LiftingCommand MultiCubeLiftingCommand quat_apply quat_inv"
+    ),
+    "mjlab.tasks.manipulation.mdp.rewards": "Entity LiftingCommand MultiCubeLiftingCommand",
+    "mjlab.tasks.manipulation.mdp.terminations": "ContactSensor",
+    "mjlab.tasks.tracking.mdp": f"{_TRACKING} quat_apply_inverse",
+    "mjlab.tasks.tracking.mdp.commands": f"{_TRACKING} CommandTerm CommandTermCfg DebugVisualizer",
+    "mjlab.tasks.tracking.mdp.observations": (
+        "MotionCommand matrix_from_quat subtract_frame_transforms"
+    ),
+    "mjlab.tasks.tracking.mdp.rewards": "ContactSensor MotionCommand",
+    "mjlab.tasks.tracking.mdp.terminations": "MotionCommand",
+    "mjlab.tasks.velocity.mdp": (
+        "matrix_from_quat quat_apply quat_apply_inverse quat_from_euler_xyz quat_mul wrap_to_pi"
+    ),
+    "mjlab.tasks.velocity.mdp.curriculums": "Entity UniformVelocityCommandCfg",
+    "mjlab.tasks.velocity.mdp.observations": "ContactSensor TerrainHeightSensor",
+    "mjlab.tasks.velocity.mdp.rewards": (
+        "BuiltinSensor ContactSensor Entity RewardTermCfg TerrainHeightSensor"
+    ),
+    "mjlab.tasks.velocity.mdp.terminations": "ContactSensor Entity",
+    "mjlab.tasks.velocity.mdp.velocity_command": "Entity matrix_from_quat",
+}
 
 _NAMES: dict[str, dict[str, str]] = {
     "mjlab.actuator": {**_XML_ACTUATORS, **_DELAYED_ACTUATORS},
@@ -82,17 +163,30 @@ _NAMES: dict[str, dict[str, str]] = {
     "mjlab.envs.mdp.events": _EVENTS,
     "mjlab.envs.mdp.dr": {"sync_actuator_delays": _EVENTS["sync_actuator_delays"]},
     "mjlab.envs.mdp.dr.actuator": {"sync_actuator_delays": _EVENTS["sync_actuator_delays"]},
+    "mjlab.scripts.csv_to_npz": {"run_sim": "mjlab.compat.older:run_sim"},
+    "mjlab.scripts.gcs": {
+        name: f"mjlab.compat.older:{name}"
+        for name in (
+            "ensure_asset_downloaded",
+            "ensure_default_checkpoint",
+            "ensure_default_motion",
+        )
+    },
     "mjlab.tasks.manipulation.mdp": {**_EVENTS, **_REWARD_WEIGHT},
     "mjlab.tasks.manipulation.mdp.curriculums": _REWARD_WEIGHT,
+    "mjlab.tasks.registry": {"_REGISTRY": "mjlab.compat.older:REGISTRY"},
     "mjlab.tasks.tracking.mdp": _EVENTS,
     "mjlab.tasks.velocity.mdp": {**_EVENTS, **_REWARD_WEIGHT, **_FLAT_ORIENTATION},
     "mjlab.tasks.velocity.mdp.curriculums": _REWARD_WEIGHT,
     "mjlab.tasks.velocity.mdp.rewards": _FLAT_ORIENTATION,
     "mjlab.terrains": _TERRAIN_IMPORTER,
+    "mjlab.terrains.heightfield_terrains": {
+        "_compute_flat_patches": "mjlab.compat.older:compute_flat_patches"
+    },
     "mjlab.terrains.terrain_importer": _TERRAIN_IMPORTER,
-    "mjlab.utils.os": {"update_assets": "mjlab.compat:update_assets"},
-    "mjlab.utils.spec": {"disable_collision": "mjlab.compat:disable_collision"},
-    "mjlab.viewer.base": {"Timer": "mjlab.compat:Timer"},
+    "mjlab.utils.os": {"update_assets": "mjlab.compat.older:update_assets"},
+    "mjlab.utils.spec": {"disable_collision": "mjlab.compat.older:disable_collision"},
+    "mjlab.viewer.base": {"Timer": "mjlab.compat.older:Timer"},
     "mjlab.viewer.viser": {
         **_VISER,
         "mujoco_mesh_to_trimesh": "mjlab.viewer.viser.conversions:mujoco_mesh_to_trimesh",
@@ -103,6 +197,22 @@ _NAMES: dict[str, dict[str, str]] = {
 # Static methods that a class once had, with the function that does it today.
 _STATIC_METHODS: dict[str, dict[str, str]] = {
     "MjlabViserScene": {"create": "mjlab.viewer.viser.scene:MjlabViserScene"},
+}
+
+for _module, _passed in _PASSED_THROUGH.items():
+    _NAMES[_module] = {
+        **{name: f"{_HOMES.get(name, _MATH)}:{name}" for name in _passed.split()},
+        **_NAMES.get(_module, {}),
+    }
+
+# Attributes that instances of a class once had, and the function of one that computes them.
+_ATTRIBUTES: dict[str, dict[str, str]] = {
+    "ContactSensor": {"_slots": "contact_slots"},
+    "DifferentialIKAction": {"_joint_ids": "ik_joint_ids"},
+    "EntityData": {"generalized_force": "generalized_force"},
+    "MetricsManager": {"_episode_sums": "episode_sums", "_step_count": "step_count"},
+    "ObservationManager": {"_group_obs_term_cfgs": "group_obs_term_cfgs"},
+    "TerminationManager": {"_truncated_buf": "truncated_buf"},
 }
 
 # Fields that a class once had, with what becomes of a value given for them, in this order. A
@@ -163,6 +273,9 @@ ALWAYS_ENABLED_FLAGS = frozenset({"multiccd"})
 _LOOSE_DEFAULTS: dict[str, dict[str, Any]] = {"CollisionCfg": _REQUIRED_BEFORE_1_6}
 
 
+_OLDER = "mjlab.compat.older"
+
+
 @functools.cache
 def _warn_once(message: str) -> None:
     # A FutureWarning, because Python hides deprecations from those who run a package.
@@ -179,6 +292,8 @@ def older_names(module_name: str) -> Callable[[str], Any]:
         home, _, today = table[name].partition(":")
         value = getattr(importlib.import_module(home), today)
         message = f"{module_name}.{name} is an older name; today it is {home}.{today}."
+        if home == _OLDER:
+            message = f"{module_name}.{name} is an older name, and is removed in mjlab 2.0."
         if inspect.isfunction(value):
             return _warning_when_called(value, message)
         _warn_once(message)
@@ -223,6 +338,27 @@ def _warning_when_called(function: Callable[..., Any], message: str) -> Callable
     return older
 
 
+class _OlderAttribute:
+    """Attribute of an instance, computed by a function of `mjlab.compat.older`."""
+
+    def __init__(self, class_name: str, name: str, function: str) -> None:
+        self._function = function
+        self._message = f"{class_name}.{name} is an older attribute, and is removed in mjlab 2.0."
+
+    def __get__(self, instance: Any, owner: type) -> Any:
+        if instance is None:
+            return self
+        _warn_once(self._message)
+        return getattr(importlib.import_module(_OLDER), self._function)(instance)
+
+
+def offers_older_attributes(cls: C) -> C:
+    """Class decorator: answer attributes that earlier releases had."""
+    for name, function in _ATTRIBUTES[cls.__name__].items():
+        setattr(cls, name, _OlderAttribute(cls.__name__, name, function))
+    return cls
+
+
 def accepts_older_fields(config_class: C) -> C:
     """Class decorator for configs: take fields that were dropped, and defaults that were lost."""
     cls: Any = config_class
@@ -249,62 +385,7 @@ def accepts_older_fields(config_class: C) -> C:
     return config_class
 
 
-# Small things that have no successor, as they were.
-
-
-def disable_collision(geom: Any) -> None:
-    """Switch off the contacts of a geom of a spec."""
-    geom.contype = 0
-    geom.conaffinity = 0
-
-
-def update_assets(
-    assets: dict[str, Any],
-    path: str | Path,
-    meshdir: str | None = None,
-    glob: str = "*",
-    recursive: bool = False,
-) -> None:
-    """Add the contents of the files in a folder to `assets`, by `<meshdir>/<file name>`."""
-    folder = Path(path)
-    for file in folder.rglob(glob) if recursive else folder.glob(glob):
-        if file.is_file():
-            assets[f"{meshdir}/{file.name}" if meshdir else file.name] = file.read_bytes()
-
-
-def get_assets(meshdir: str) -> dict[str, bytes]:
-    """Return the mesh files of a robot by path: none, as ours are drawn with primitive shapes."""
-    return {}
-
-
 def set_array_field(field: Any, values: Any) -> None:
     """Write `values` into the first elements of an array field of a spec; None leaves it."""
     for index, value in enumerate(values or ()):
         field[index] = value
-
-
-def rotation_quat_from_vectors(from_vec: Any, to_vec: Any) -> Any:
-    """Return the quaternion (w, x, y, z) of the shortest rotation between two vectors."""
-    import numpy as np
-
-    start = np.asarray(from_vec, dtype=float) / np.linalg.norm(from_vec)
-    end = np.asarray(to_vec, dtype=float) / np.linalg.norm(to_vec)
-    quat = np.array([1.0 + start @ end, *np.cross(start, end)])
-    if quat[0] < 1e-9:
-        # Opposite vectors: half a turn about any axis across them.
-        axis = np.cross(start, np.eye(3)[np.argmin(np.abs(start))])
-        quat = np.array([0.0, *axis])
-    return quat / np.linalg.norm(quat)
-
-
-class Timer:
-    """Measures wall time between ticks, in seconds."""
-
-    def __init__(self) -> None:
-        self._previous = time.time()
-
-    def tick(self) -> float:
-        """Return the time since the last tick."""
-        now = time.time()
-        elapsed, self._previous = now - self._previous, now
-        return elapsed

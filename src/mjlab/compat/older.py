@@ -1,0 +1,506 @@
+"""Names of earlier 1.x releases that have no successor; reached by name, through the table.
+
+The `mdp` packages of the tasks export functions from here, so imports at the top are limited to
+`mjlab.envs` and what it imports; the rest is imported where it is used.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import tempfile
+import time
+from abc import ABCMeta
+from collections.abc import Iterator, MutableMapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
+
+import numpy as np
+import torch
+
+from mjlab.actuator.actuator import Actuator, ActuatorCfg
+from mjlab.envs.mdp._indexing import resolve_env_ids
+from mjlab.envs.mdp.dr._actuator_selection import selected_actuators
+from mjlab.envs.mdp.dr._core import FieldRow, randomize
+from mjlab.envs.mdp.dr._selection import BODY, GEOM, SITE
+from mjlab.envs.mdp.dr._table import TABLE
+from mjlab.envs.mdp.dr._terms import ROBOT
+from mjlab.managers.model_fields import RecomputeLevel, derived_fields
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.envs.mdp.actions import DifferentialIKAction
+    from mjlab.managers import MetricsManager, ObservationManager, TerminationManager
+    from mjlab.managers.scene_entity_config import SceneEntityCfg
+    from mjlab.sensor import ContactSensor
+
+logger = logging.getLogger(__name__)
+
+
+class DelayedActuatorCfg:
+    """`DelayedActuatorCfg(base_cfg=..., delay_max_lag=...)` returns `base_cfg` with these delays.
+
+    Today every actuator config takes `delay_min_lag` and so on itself. The whole command is
+    delayed, whichever part `delay_target` names.
+    """
+
+    def __new__(  # type: ignore[misc]
+        cls,
+        *,
+        base_cfg: ActuatorCfg,
+        delay_target: Any = "position",
+        delay_min_lag: int = 0,
+        delay_max_lag: int = 1,
+        delay_hold_prob: float = 0.0,
+        delay_update_period: int = 0,
+        delay_per_env_phase: bool = True,
+    ) -> ActuatorCfg:
+        return dataclasses.replace(
+            base_cfg,
+            delay_min_lag=delay_min_lag,
+            delay_max_lag=delay_max_lag,
+            delay_hold_prob=delay_hold_prob,
+            delay_update_period=delay_update_period,
+            delay_per_env_phase=delay_per_env_phase,
+        )
+
+
+class _HasDelay(ABCMeta):
+    def __instancecheck__(cls, instance: Any) -> bool:
+        return isinstance(instance, Actuator) and instance.has_delay
+
+
+class DelayedActuator(Actuator, metaclass=_HasDelay):
+    """Any actuator that has a delay is an instance of this."""
+
+
+@dataclass
+class FieldSpec:
+    """How a field was described to `randomize_field`; kept for packages that build one."""
+
+    entity_type: Literal["dof", "joint", "body", "geom", "site", "actuator"]
+    use_address: bool = False
+    default_axes: list[int] | None = None
+    valid_axes: list[int] | None = None
+
+
+# Quaternions were randomized component by component.
+_QUATERNIONS = {
+    row.name: row
+    for row in (
+        FieldRow("body_iquat", "body_iquat", BODY, "", recompute=RecomputeLevel.set_const),
+        FieldRow("geom_quat", "geom_quat", GEOM, ""),
+        FieldRow("site_quat", "site_quat", SITE, ""),
+    )
+}
+_FIELDS = (
+    "dof_armature",
+    "dof_frictionloss",
+    "dof_damping",
+    "jnt_range",
+    "jnt_stiffness",
+    "body_mass",
+    "body_ipos",
+    "geom_friction",
+    "geom_pos",
+    "geom_rgba",
+    "site_pos",
+    "qpos0",
+)
+_ROWS = {
+    **{row.field: row for row in TABLE.values() if row.field in _FIELDS},
+    **_QUATERNIONS,
+}
+
+
+def randomize_field(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor | None,
+    field: str,
+    ranges: Any,
+    distribution: str = "uniform",
+    operation: str = "abs",
+    asset_cfg: SceneEntityCfg | None = None,
+    axes: list[int] | None = None,
+    shared_random: bool = False,
+) -> None:
+    """Randomize the model field called `field`; today each field has a function of its own.
+
+    Expands the field if no term has declared it, and recomputes the constants that depend on it.
+    Raises `ValueError` for a field it does not know.
+    """
+    row = _row(field)
+    env.sim.expand_model_fields(row.fields)
+    randomize(
+        row,
+        env,
+        env_ids,
+        ranges,
+        ROBOT if asset_cfg is None else asset_cfg,
+        distribution,
+        operation,
+        axes,
+        shared_random,
+    )
+
+
+def _row(field: str) -> FieldRow:
+    if field not in _ROWS:
+        raise ValueError(
+            f"randomize_field knows no field {field!r}. Choose one of {sorted(_ROWS)}."
+        )
+    return _ROWS[field]
+
+
+def _fields_of(params: dict[str, Any]) -> tuple[str, ...]:
+    row = _row(params["field"])
+    return (*row.fields, *derived_fields(row.recompute))
+
+
+# Which fields an event changes depends on its parameters here, so the event manager asks.
+setattr(randomize_field, "model_fields", _fields_of)  # noqa: B010
+setattr(randomize_field, "recompute", lambda params: _row(params["field"]).recompute)  # noqa: B010
+
+
+def sync_actuator_delays(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor | None,
+    lag_range: tuple[int, int],
+    asset_cfg: SceneEntityCfg = ROBOT,
+) -> None:
+    """Set one lag, drawn per environment, on all delayed actuators of the selection.
+
+    Args:
+        lag_range: Smallest and largest lag (physics substeps), both included.
+    """
+    low, high = int(lag_range[0]), int(lag_range[1])
+    if not 0 <= low <= high:
+        raise ValueError(f"lag_range must be 0 <= smallest <= largest, got {tuple(lag_range)}.")
+    rows = resolve_env_ids(env, env_ids)
+    lags = torch.randint(low, high + 1, (len(rows),), device=env.device)
+    for selected in selected_actuators(env, rows, asset_cfg):
+        if selected.actuator.has_delay:
+            selected.actuator.set_lags(lags, rows)
+
+
+class RewardWeightStage(TypedDict):
+    """A reward weight, and the number of environment steps after which it holds."""
+
+    step: int
+    weight: float
+
+
+def reward_weight(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor,
+    reward_name: str,
+    weight_stages: list[RewardWeightStage],
+) -> torch.Tensor:
+    """Set a reward's weight to that of the last stage whose step has been passed, and return it.
+
+    Unlike `reward_curriculum`, a stage starts one step after its `step`.
+    """
+    cfg = env.reward_manager.get_term_cfg(reward_name)
+    for stage in weight_stages:
+        if env.common_step_counter > stage["step"]:
+            cfg.weight = stage["weight"]
+    return torch.tensor([cfg.weight])
+
+
+def flat_orientation(
+    env: ManagerBasedRlEnv, std: float, asset_cfg: SceneEntityCfg = ROBOT
+) -> torch.Tensor:
+    """Reward a body that stands upright: `upright` without terrain sensors."""
+    from mjlab.tasks.velocity.mdp._shared import single_body, tilt_of
+
+    asset: Entity = env.scene[asset_cfg.name]
+    body = single_body(env, asset_cfg)
+    data = asset.data
+    quat = data.root_link_quat_w if body is None else data.body_link_quat_w[:, body]
+    return torch.exp(tilt_of(quat) / -(std**2))
+
+
+def disable_collision(geom: Any) -> None:
+    """Switch off the contacts of a geom of a spec."""
+    geom.contype = 0
+    geom.conaffinity = 0
+
+
+def update_assets(
+    assets: dict[str, Any],
+    path: str | Path,
+    meshdir: str | None = None,
+    glob: str = "*",
+    recursive: bool = False,
+) -> None:
+    """Add the contents of the files in a folder to `assets`, by `<meshdir>/<file name>`."""
+    folder = Path(path)
+    for file in folder.rglob(glob) if recursive else folder.glob(glob):
+        if file.is_file():
+            assets[f"{meshdir}/{file.name}" if meshdir else file.name] = file.read_bytes()
+
+
+def get_assets(meshdir: str) -> dict[str, bytes]:
+    """Return the mesh files of a robot by path: none, as ours are drawn with primitive shapes."""
+    return {}
+
+
+def rotation_quat_from_vectors(from_vec: Any, to_vec: Any) -> Any:
+    """Return the quaternion (w, x, y, z) of the shortest rotation between two vectors."""
+    start = np.asarray(from_vec, dtype=float) / np.linalg.norm(from_vec)
+    end = np.asarray(to_vec, dtype=float) / np.linalg.norm(to_vec)
+    quat = np.array([1.0 + start @ end, *np.cross(start, end)])
+    if quat[0] < 1e-9:
+        # Opposite vectors: half a turn about any axis across them.
+        axis = np.cross(start, np.eye(3)[np.argmin(np.abs(start))])
+        quat = np.array([0.0, *axis])
+    return quat / np.linalg.norm(quat)
+
+
+class Timer:
+    """Measures wall time between ticks, in seconds."""
+
+    def __init__(self) -> None:
+        self._previous = time.time()
+
+    def tick(self) -> float:
+        """Return the time since the last tick."""
+        now = time.time()
+        elapsed, self._previous = now - self._previous, now
+        return elapsed
+
+
+def compute_flat_patches(
+    noise: np.ndarray,
+    vertical_scale: float,
+    horizontal_scale: float,
+    z_offset: float,
+    flat_patch_sampling: dict[str, Any] | None,
+    rng: np.random.Generator,
+) -> dict[str, np.ndarray] | None:
+    """Return the flat patches of a height field of integers, (number, 3) by name.
+
+    `z_offset` is the height of the field's lowest point.
+    """
+    from mjlab.terrains.utils import find_flat_patches_from_heightfield
+
+    if flat_patch_sampling is None:
+        return None
+    heights = (noise - noise.min()) * vertical_scale
+    return {
+        name: find_flat_patches_from_heightfield(heights, horizontal_scale, z_offset, cfg, rng)
+        for name, cfg in flat_patch_sampling.items()
+    }
+
+
+# Attributes of instances.
+
+
+@dataclass(frozen=True)
+class ContactSlot:
+    """One field of one primary of a contact sensor."""
+
+    primary_name: str
+    """Name of the primary."""
+    field_name: str
+    """Name of the field."""
+    sensor_name: str
+    """Name of the MuJoCo sensor, which measures all fields of the primary."""
+    sensor: ContactSensor
+    """The contact sensor."""
+    index: int
+    """Index of the primary."""
+
+    @property
+    def data_view(self) -> torch.Tensor:
+        """Present values, (N, number of slots times size of the field)."""
+        layout = self.sensor._layout
+        values = layout.split(self.sensor._block())[self.field_name]
+        first = self.index * layout.num_slots
+        return values[:, first : first + layout.num_slots].flatten(1)
+
+
+def contact_slots(sensor: ContactSensor) -> list[ContactSlot]:
+    """Return the fields of each primary, one primary after the other."""
+    return [
+        ContactSlot(primary, field, sensor._element_name(primary), sensor, index)
+        for index, primary in enumerate(sensor.primary_names)
+        for field in sensor.cfg.fields
+    ]
+
+
+def ik_joint_ids(action: DifferentialIKAction) -> torch.Tensor:
+    """Return the entity's joints that the action moves, (number of joints,)."""
+    count = action._entity.num_joints
+    return torch.arange(count, device=action.device)[action._columns]
+
+
+def generalized_force(data: Any) -> torch.Tensor:
+    """Return the applied generalized forces of the entity's joints, (N, nj)."""
+    return data._columns("qfrc_applied", data._joint_v)
+
+
+def step_count(manager: MetricsManager) -> torch.Tensor:
+    """Return the steps of each running episode, (N,) int64."""
+    return manager._steps.long()
+
+
+def episode_sums(manager: MetricsManager) -> dict[str, torch.Tensor]:
+    """Return the sum of each metric over the running episodes, views (N,) by name."""
+    return dict(zip(manager.active_terms, manager._sum, strict=True))
+
+
+def group_obs_term_cfgs(manager: ObservationManager) -> dict[str, list[Any]]:
+    """Return the live configs of the terms of each group."""
+    return {
+        group: [manager.get_term_cfg(group, term) for term in terms]
+        for group, terms in manager.active_terms.items()
+    }
+
+
+def truncated_buf(manager: TerminationManager) -> torch.Tensor:
+    """Return the buffer of time-outs, (N,) bool."""
+    return manager.time_outs
+
+
+# The registry as a dict.
+
+
+@dataclass
+class RegisteredTask:
+    """A task's configs, as copies, and its runner class."""
+
+    env_cfg: Any
+    """Environment config to train with."""
+    play_env_cfg: Any
+    """Environment config to play with."""
+    rl_cfg: Any
+    """Config of the learner."""
+    runner_cls: type | None
+    """Class of the runner; None for the default."""
+
+
+class _Registry(MutableMapping[str, RegisteredTask]):
+    """All tasks by name."""
+
+    def __getitem__(self, name: str) -> RegisteredTask:
+        from mjlab.tasks import registry
+
+        return RegisteredTask(
+            registry.load_env_cfg(name),
+            registry.load_env_cfg(name, play=True),
+            registry.load_rl_cfg(name),
+            registry.load_runner_cls(name),
+        )
+
+    def __setitem__(self, name: str, task: RegisteredTask) -> None:
+        from mjlab.tasks import registry
+
+        if name in self:
+            del self[name]
+        registry.register_mjlab_task(
+            name, task.env_cfg, task.play_env_cfg, task.rl_cfg, task.runner_cls
+        )
+
+    def __delitem__(self, name: str) -> None:
+        from mjlab.tasks import registry
+
+        registry.require_task(name)
+        del registry._tasks[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in iter(self)
+
+    def __iter__(self) -> Iterator[str]:
+        from mjlab.tasks import registry
+
+        return iter(registry.list_tasks())
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+
+REGISTRY = _Registry()
+
+
+# Functions of scripts.
+
+
+def run_sim(
+    sim: Any,
+    scene: Any,
+    joint_names: Sequence[str],
+    input_file: str,
+    input_fps: float,
+    output_fps: float,
+    output_name: str,
+    render: bool,
+    line_range: tuple[int, int] | None,
+    renderer: Any = None,
+) -> None:
+    """Write the motion of the scene's `robot` in a CSV of poses to `motion.npz`.
+
+    The file is in the folder of temporary files, as in 1.6; a copy named `<output_name>.npz` is
+    in the working folder. `csv_to_npz` uploads it with `--upload True`.
+
+    Args:
+        sim: Without effect; the conversion needs no simulation.
+        scene: The scene that has the robot.
+        joint_names: Joints in the order of the columns. Others keep their default position.
+        input_file: The CSV.
+        input_fps: Its poses per second.
+        output_fps: Frames per second of the motion.
+        output_name: Name of the motion.
+        render: Record a video beside the copy.
+        line_range: First and last line to read, counted from 1. None reads all.
+        renderer: Without effect.
+    """
+    from mjlab.scripts.csv_to_npz_run import record_motion
+    from mjlab.tasks.tracking.motion_csv import read_csv
+    from mjlab.tasks.tracking.motion_file import npz_path, write_motion
+    from mjlab.tasks.tracking.motion_kinematics import make_motion, resampled
+
+    robot = scene["robot"]
+    recording = read_csv(input_file, input_fps, joint_names, line_range)
+    joint_pos = robot.data.default_joint_pos[0].cpu().numpy()
+    joint_pos = np.tile(joint_pos, (len(recording), 1)).astype(recording.joint_pos.dtype)
+    columns, _ = robot.find_joints(joint_names, preserve_order=True)
+    joint_pos[:, columns] = recording.joint_pos
+    recording = dataclasses.replace(recording, joint_pos=joint_pos)
+    robot = robot.cfg.build()
+    motion = make_motion(
+        resampled(recording, output_fps), robot.compile(), robot.joint_names, robot.body_names
+    )
+    write_motion(Path(tempfile.gettempdir()) / "motion.npz", motion)
+    path = write_motion(npz_path(f"{output_name}.npz"), motion)
+    logger.warning("Motion written to %s; upload it with csv_to_npz --upload True.", path)
+    if render:
+        record_motion(motion, robot, path.with_suffix(".mp4"))
+
+
+_DEMO_MOTION = "slow_walk"
+
+
+def ensure_default_motion() -> str:
+    """Return the path of a motion of the G1 that ships with the package."""
+    from mjlab.tasks.tracking.motion_sources import shipped_motions
+
+    return str(shipped_motions()[_DEMO_MOTION])
+
+
+def ensure_default_checkpoint() -> str:
+    """Raise `FileNotFoundError`: no tracking policy ships with the package."""
+    raise FileNotFoundError(
+        "mjlab ships no checkpoint of motion tracking; train one with "
+        "`train Mjlab-Tracking-Flat-Unitree-G1`, or run `demo`, which brings a policy of the Go1."
+    )
+
+
+def ensure_asset_downloaded(asset_name: str, force_download: bool = False) -> Path:
+    """Return the path of `demo_motion.npz`; `demo_ckpt.pt` is not available."""
+    assets = {"demo_motion.npz": ensure_default_motion, "demo_ckpt.pt": ensure_default_checkpoint}
+    if asset_name not in assets:
+        raise ValueError(f"asset_name: expected one of {sorted(assets)}, got {asset_name!r}.")
+    return Path(assets[asset_name]())
