@@ -19,6 +19,7 @@ from typing import Any
 from mjlab import compat
 
 LIST = Path(__file__).parent / "data" / "public_interface.txt"
+COMMAND_LINE = LIST.with_name("command_line.txt")
 OLDER = Path(__file__).parent / "data" / "older_interface.txt"
 KINDS = Path(__file__).parent / "data" / "config_kinds.txt"
 
@@ -49,14 +50,12 @@ class Entry:
 
 
 def entries() -> list[Entry]:
-    """Return all entries of the list; those of the command line, at its end, are not modules."""
+    """Return all entries of the list."""
     found: list[Entry] = []
     module = ""
     for line in LIST.read_text().splitlines():
         if line.startswith("## "):
             module = line[3:].strip()
-            if not module.startswith("mjlab"):
-                break
         elif line.startswith(" "):
             found[-1] = dataclasses.replace(found[-1], members=(*found[-1].members, line.strip()))
         elif line.strip() and line not in NOISE:
@@ -98,10 +97,9 @@ def is_offered(entry: Entry) -> bool:
 
 def command_line() -> dict[str, list[str]]:
     """Return the fields of the command lines' config classes, by the path of the class."""
-    text = LIST.read_text().partition("## command line")[2]
     found: dict[str, list[str]] = {}
     current = ""
-    for line in text.splitlines()[1:]:
+    for line in COMMAND_LINE.read_text().splitlines():
         if line.startswith("class "):
             current = line.split()[1]
             found[current] = []
