@@ -271,6 +271,15 @@ _DROPPED_FIELDS: dict[str, dict[str, tuple[str, _Translation | None]]] = {
 # MuJoCo features that earlier releases had to enable and today's has on.
 ALWAYS_ENABLED_FLAGS = frozenset({"multiccd"})
 _LOOSE_DEFAULTS: dict[str, dict[str, Any]] = {"CollisionCfg": _REQUIRED_BEFORE_1_6}
+# Methods that subclasses override and that once took fewer arguments: the argument that an older
+# override lacks, and the function that calls it with today's arguments, as "module:function".
+_OLDER_METHODS: dict[str, dict[str, tuple[str, str]]] = {
+    "CommandTerm": {
+        "_update_command": ("env_ids", "mjlab.compat.older_terms:update_command"),
+        "compute": ("env_ids", "mjlab.compat.older_terms:compute"),
+        "create_gui": ("on_change", "mjlab.compat.older_terms:create_gui"),
+    },
+}
 
 
 _OLDER = "mjlab.compat.older"
@@ -385,6 +394,41 @@ def accepts_older_fields(config_class: C) -> C:
     return config_class
 
 
+def accept_older_methods(base: type, subclass: type) -> None:
+    """Make methods of `subclass` callable as those of `base` are today.
+
+    `base` calls it from `__init_subclass__`. An override in the spelling of an earlier release is
+    replaced by a method that takes today's arguments and calls it.
+    """
+    for name, (argument, caller) in _OLDER_METHODS[base.__name__].items():
+        method = getattr(subclass, name)
+        position = list(inspect.signature(getattr(base, name)).parameters).index(argument)
+        if inspect.isfunction(method) and not _takes(method, argument, position):
+            setattr(subclass, name, _called_as_today(method, argument, caller))
+
+
+def _takes(method: Callable[..., Any], argument: str, position: int) -> bool:
+    """Return whether a method takes an argument by position, under that name or as a required one."""
+    parameters = inspect.signature(method).parameters.values()
+    if any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters):
+        return True
+    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    required = [p for p in positional if p.default is p.empty]
+    return len(required) > position or any(p.name == argument for p in positional)
+
+
+def _called_as_today(method: Callable[..., Any], argument: str, caller: str) -> Callable[..., Any]:
+    message = f"{method.__qualname__} takes no {argument}, as in an earlier release; today it does."
+    home, _, function = caller.partition(":")
+
+    @functools.wraps(method)
+    def older(*args: Any, **kwargs: Any) -> Any:
+        _warn_once(message)
+        return getattr(importlib.import_module(home), function)(method, *args, **kwargs)
+
+    # Signatures are read from what is wrapped, and a subclass must see that this takes everything.
+    del older.__wrapped__
+    return older
 def set_array_field(field: Any, values: Any) -> None:
     """Write `values` into the first elements of an array field of a spec; None leaves it."""
     for index, value in enumerate(values or ()):
