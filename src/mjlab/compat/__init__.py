@@ -394,6 +394,27 @@ def accepts_older_fields(config_class: C) -> C:
     return config_class
 
 
+def older_defaults(config_class: type, missing: dict[str, list[str]]) -> dict[str, Any]:
+    """Return the values of fields that a dict by pattern leaves open, and warn once if any is.
+
+    Args:
+        config_class: The config.
+        missing: By field, the elements that none of its patterns matches.
+    """
+    defaults = _LOOSE_DEFAULTS[config_class.__name__]
+    gaps = [
+        f"{name} of {names[:8]}{' and others' if len(names) > 8 else ''} is {defaults[name]}"
+        for name, names in missing.items()
+        if names
+    ]
+    if gaps:
+        _warn_once(
+            f"{config_class.__name__}: no pattern matches some elements, so {', '.join(gaps)}. "
+            "Today patterns cover all; add a last pattern '.*'."
+        )
+    return defaults
+
+
 def accept_older_methods(base: type, subclass: type) -> None:
     """Make methods of `subclass` callable as those of `base` are today.
 
