@@ -82,7 +82,9 @@ def test_geoms_that_no_pattern_names_get_the_defaults_of_earlier_releases_with_o
     for geom in spec.geoms:
         geom.condim, geom.priority, geom.contype, geom.conaffinity = 6, 2, 4, 8
     partial = {"foot_left": 4}
-    cfg = CollisionCfg((".*",), contype=partial, conaffinity=partial, condim=partial, priority=partial)
+    cfg = CollisionCfg(
+        (".*",), contype=partial, conaffinity=partial, condim=partial, priority=partial
+    )
     with pytest.warns(FutureWarning, match=r"no pattern matches.*'foot_right'.*\.\*") as record:
         cfg.edit_spec(spec)
         cfg.edit_spec(spec)
