@@ -115,7 +115,7 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
         self, path: str, filename: str = "policy.onnx", verbose: bool = False
     ) -> None:
         """Write the policy and the reference to `path`/`filename`: see `PolicyWithReference`."""
-        motion = getattr(self.motion_command, "motion", None)
+        motion: Any = getattr(self.motion_command, "motion", None)
         missing = [name for name in (*REFERENCE, "time_step_total") if not hasattr(motion, name)]
         if missing:
             logger.info("The policy is exported without the motion, which has no %s.", missing)
