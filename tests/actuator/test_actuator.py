@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -388,17 +389,22 @@ def test_delay_line_survives_capture_and_restore(make_world):
     assert [write(world, float(k)) for k in range(5, 10)] == expected
 
 
-def test_older_delayed_config_puts_its_delay_on_the_config_it_wraps(make_world):
+def test_older_delayed_config_delays_the_config_it_wraps(make_world):
     with pytest.warns(FutureWarning, match="is an older name"):
         from mjlab.actuator import DelayedActuator, DelayedActuatorCfg
     from mjlab.actuator.delayed_actuator import DelayedActuatorCfg as SameCfg
 
     assert SameCfg is DelayedActuatorCfg
-    cfg = DelayedActuatorCfg(
-        base_cfg=motor_cfg(), delay_target="effort", delay_min_lag=2, delay_max_lag=2
-    )
-    assert isinstance(cfg, BuiltinMotorActuatorCfg)
+    base = motor_cfg()
+    cfg = DelayedActuatorCfg(base_cfg=base, delay_target="effort", delay_max_lag=2)
+    assert isinstance(cfg, DelayedActuatorCfg)
+    assert cfg.base_cfg is base
+    assert cfg.target_names_expr == base.target_names_expr
+    assert not isinstance(base, DelayedActuatorCfg)
+    cfg = dataclasses.replace(cfg, delay_min_lag=2)
     world = make_world(cfg)
     assert isinstance(world.entity.actuators[0], DelayedActuator)
+    assert isinstance(world.entity.actuators[0].cfg, BuiltinMotorActuatorCfg)
+    assert not make_world(DelayedActuatorCfg(base_cfg=base)).entity.actuators[0].has_delay
     assert [write(world, float(k))[0] for k in range(1, 5)] == [1.0, 1.0, 1.0, 2.0]
     assert not isinstance(make_world(motor_cfg()).entity.actuators[0], DelayedActuator)

@@ -88,12 +88,6 @@ IN_XML = '<actuator><motor name="drive" joint="knee"/></actuator></mujoco>'
     [
         ((SERVO, MOTOR), False, r"MotorActuatorCfg.*'knee' has one by BuiltinPositionActuatorCfg"),
         ((SERVO, SERVO), False, r"'hip' has one .*, 'knee' has one "),
-        ((SERVO,), True, r"'knee' has the actuator 'drive' of the XML.*XmlActuatorCfg"),
-        (
-            (XmlActuatorCfg(target_names_expr=("knee",)), MOTOR),
-            True,
-            "'knee' has the actuator 'drive'",
-        ),
         ((XmlActuatorCfg(target_names_expr=("knee",)),) * 2, True, "'knee' has one by XmlActuator"),
     ],
 )
@@ -106,6 +100,37 @@ def test_an_actuator_on_a_joint_that_has_one_already_is_refused(kit, actuators, 
                 cfg.build()
             if order is actuators:
                 assert re.search(said, str(caught.value))
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+@pytest.mark.parametrize("sort", [False, True])
+def test_an_actuator_beside_one_of_the_xml_is_accepted_with_a_warning_and_both_act(
+    kit, wrapped, sort
+):
+    actuators = [SERVO, *([XmlActuatorCfg(target_names_expr=("knee",))] if wrapped else [])]
+    cfg = kit.cfg(
+        kit.ROBOT.replace("</mujoco>", IN_XML),
+        sort_actuators=sort,
+        articulation=actuated(*actuators),
+    )
+    with pytest.warns(UserWarning, match="'knee' has the actuator 'drive' of the XML. Both act"):
+        sim, scene = kit.make(1, robot=cfg)
+    robot = scene["robot"]
+    robot.set_joint_position_target(torch.tensor([[0.0, 0.5]]))
+    robot.set_joint_effort_target(torch.tensor([[0.0, 2.0]]))
+    robot.write_joint_state_to_sim(torch.zeros(1, 2), torch.zeros(1, 2))
+    if not wrapped:
+        sim.data.ctrl[:, robot.actuator_names.index("drive")] = 2.0
+    scene.write_data_to_sim()
+    sim.forward()
+    # The servo's share is its stiffness of 1 times the distance.
+    assert sim.data.qfrc_actuator[0, -1].item() == pytest.approx(0.5 + 2.0)
+
+
+def test_an_actuator_with_the_name_of_one_of_the_xml_is_refused(kit):
+    xml = kit.ROBOT.replace("</mujoco>", IN_XML.replace("drive", "knee"))
+    with pytest.raises(ValueError, match="'knee' has the actuator 'knee' of the XML"):
+        kit.cfg(xml, articulation=actuated(SERVO)).build()
 
 
 def test_actuators_of_the_xml_and_others_may_share_a_pattern_but_no_joint(kit):

@@ -13,7 +13,7 @@ from mjlab.sim import Simulation
 from mjlab.viewer.model_sync import compute_poses, copy_state, host_model, sync_model_fields
 from mjlab.viewer.viser.scene import MjlabViserScene
 
-from .variant_objects import THINGS, make_scene, plain, simulate, thing
+from .variant_objects import THINGS, make_scene, plain, present_geoms, simulate, thing
 
 
 def of_all_things() -> Simulation:
@@ -130,3 +130,45 @@ def test_cameras_show_each_environment_its_own_variant(engine: str) -> None:
         assert alike.float().mean() >= share
         shown.add(tuple(found.depth[env].flatten().round(decimals=3).tolist()))
     assert len(shown) == 5
+
+
+WITH_UV = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 0 1\n"
+WITH_UV += "f 1/1 3/3 2/2\nf 1/1 2/2 4/3\nf 1/1 4/3 3/2\nf 2/1 3/2 4/3\n"
+SHADES = {"dark": 40, "mid": 120, "light": 220}
+FILES = (
+    '<texture name="skin" type="2d" file="skin.png"/><mesh name="m" file="m.obj" scale=".1 .1 .1"/>'
+)
+TEXTURED = """<mujoco><asset>{files}<texture name="plain" type="2d" builtin="flat" width="2" height="2"
+  rgb1=".2 .2 .2"/><material name="paint" texture="skin"/><material name="base" texture="plain"/>
+  </asset><worldbody><body name="thing"><freejoint/>
+  <geom type="mesh" mesh="m" material="paint" contype="0" conaffinity="0"/>
+  <geom type="mesh" mesh="m" material="base"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("in_memory", [False, True])
+def test_meshes_of_each_variant_keep_their_textures(tmp_path, in_memory) -> None:
+    """Each variant has files of its own, under the same names."""
+    from matplotlib import image
+
+    def make(name: str) -> mujoco.MjSpec:
+        folder = tmp_path / name
+        xml = TEXTURED.format(files=FILES)
+        if in_memory:
+            assets = {file.name: file.read_bytes() for file in folder.iterdir()}
+            return mujoco.MjSpec.from_string(xml, assets=assets)
+        (folder / "thing.xml").write_text(xml)
+        return mujoco.MjSpec.from_file(str(folder / "thing.xml"))
+
+    for name, shade in SHADES.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "m.obj").write_text(WITH_UV)
+        image.imsave(tmp_path / name / "skin.png", np.full((4, 4, 3), shade, np.uint8))
+    variants = {name: lambda name=name: make(name) for name in SHADES}
+    sim = simulate(make_scene(3, {"thing": VariantEntityCfg(variants=variants)}))
+    model = sim.mj_model
+    role = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
+    for env, shade in enumerate(SHADES.values()):
+        materials = sim.model.geom_matid[env, present_geoms(sim, env, "thing/thing")]
+        textures = [model.mat_texid[material, role] for material in materials.tolist()]
+        pixels = [model.tex_data[model.tex_adr[t]] for t in textures]
+        assert sorted(pixels) == sorted([shade, 51])

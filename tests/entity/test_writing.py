@@ -208,15 +208,34 @@ def test_writing_what_the_entity_does_not_have_is_refused(kit):
         ("write_root_link_velocity_to_sim", 6, 3),
         ("write_root_link_velocity_b_to_sim", 6, 1),
         ("write_root_com_velocity_to_sim", 6, 7),
-        ("write_joint_position_to_sim", 2, 1),
+        ("write_joint_position_to_sim", 2, 4),
         ("write_joint_velocity_to_sim", 2, 3),
-        ("set_joint_position_target", 2, 1),
+        ("set_joint_position_target", 2, 3),
     ],
 )
 def test_a_wrong_width_is_reported_with_both_numbers(floating, writer, width, given):
     _, robot = floating
     with pytest.raises(ValueError, match=rf"has {given} values.*but {width} are to be written"):
         getattr(robot, writer)(torch.zeros(NUM_ENVS, given))
+
+
+def test_one_value_per_environment_counts_for_all_joints(floating, env_ids):
+    sim, robot = floating
+    rows = chosen(env_ids)
+    before = sim.data.qpos.clone()
+    value = torch.randn(len(rows), 1)
+    robot.write_joint_state_to_sim(value, 2 * value, env_ids=env_ids)
+    torch.testing.assert_close(robot.data.joint_pos[rows], value.expand(-1, 2))
+    torch.testing.assert_close(robot.data.joint_vel[rows], 2 * value.expand(-1, 2))
+    robot.write_joint_position_to_sim(3 * value, joint_ids=[1, 0], env_ids=env_ids)
+    robot.write_joint_velocity_to_sim(4 * value, joint_ids=torch.tensor([0]), env_ids=env_ids)
+    torch.testing.assert_close(robot.data.joint_pos[rows], 3 * value.expand(-1, 2))
+    torch.testing.assert_close(robot.data.joint_vel[rows], torch.cat((4 * value, 2 * value), 1))
+    for kind in ("position", "velocity", "effort"):
+        getattr(robot, f"set_joint_{kind}_target")(value, env_ids=env_ids)
+    for target in ("joint_pos_target", "joint_vel_target", "joint_effort_target"):
+        torch.testing.assert_close(getattr(robot.data, target)[rows], value.expand(-1, 2))
+    assert torch.equal(sim.data.qpos[others(env_ids)], before[others(env_ids)])
 
 
 def test_reset_zeroes_targets_of_these_environments_and_keeps_the_bias(kit, env_ids):

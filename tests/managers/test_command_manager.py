@@ -163,15 +163,6 @@ def test_commands_are_found_by_name_or_the_names_listed(env):
             method("goat")
 
 
-def test_an_update_without_env_ids_is_refused_with_a_hint(env):
-    class Old(Count):
-        def _update_command(self):
-            pass
-
-    with pytest.raises(TypeError, match=r"Old._update_command.*env_ids"):
-        make(env, term=Old)
-
-
 def test_build_must_return_a_command(env):
     with pytest.raises(TypeError, match="'goal'.*CommandTerm.*object"):
         make(env, term=lambda cfg, env: object())

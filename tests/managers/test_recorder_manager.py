@@ -73,3 +73,8 @@ class Broken(RecorderTerm):
 def test_an_error_while_a_recorder_is_built_names_it(env):
     with pytest.raises(ValueError, match="RecorderManager term 'a': no folder"):
         RecorderManager({"a": RecorderTermCfg(func=Broken)}, env)
+
+
+def test_a_recorder_that_is_called_says_what_to_override(env):
+    with pytest.raises(NotImplementedError, match="Notes is not called; override its hooks"):
+        Notes(RecorderTermCfg(func=Notes), env)()

@@ -116,6 +116,15 @@ def test_the_policy_decides_about_several_secondaries():
     assert elements(robot(primary, geom("left_foot", "robot"), secondary_policy="error"))
 
 
+def test_a_secondary_may_have_several_patterns():
+    primary = geom("trunk_collision", "robot")
+    feet = geom(("right_foot", "left_foot"), "robot")
+    assert elements(robot(primary, feet))[0][1] == "robot/left_foot"
+    assert elements(robot(primary, feet, secondary_policy="any"))[0][1] == ""
+    with pytest.raises(ValueError, match=r"matches \['left_foot', 'right_foot'\]. Narrow it"):
+        robot(primary, feet, secondary_policy="error")
+
+
 def test_a_secondary_subtree_is_named_in_its_entity():
     scene = robot(subtree("trunk", "robot"), subtree("trunk", "robot"))
     assert elements(scene) == [("robot/trunk", "robot/trunk")]
@@ -160,7 +169,6 @@ def test_every_pattern_has_to_match_and_no_name_twice():
         ({"num_slots": 0}, "num_slots=0"),
         ({"history_length": -1}, "history_length=-1"),
         ({"fields": ("force",), "track_air_time": True}, "needs 'found'"),
-        ({"secondary": geom(("a", "b"))}, "must be one string"),
         ({"global_frame": True, "fields": ("force", "normal")}, "needs tangent among the fields"),
         (
             {"global_frame": True, "reduce": "netforce", "fields": ("force", "normal", "tangent")},
@@ -176,9 +184,20 @@ def test_a_config_that_makes_no_sense_is_refused(fields, message):
 def test_a_match_that_makes_no_sense_is_refused():
     with pytest.raises(ValueError, match="choose from: geom, body, subtree"):
         ContactMatch(mode="joint", pattern="x")
-    for pattern in ("", (), ("a", "")):
-        with pytest.raises(ValueError, match="must name something"):
-            ContactMatch(mode="geom", pattern=pattern)
+
+
+@pytest.mark.parametrize("pattern", ["", (), ("left_foot", "")])
+def test_an_empty_pattern_may_be_filled_in_until_the_scene_is_built(pattern):
+    cfg = sense(ContactMatch("geom", pattern, "robot"), ContactMatch("geom", pattern, "robot"))
+    with pytest.raises(ValueError, match="primary pattern: expected at least one name"):
+        compose(cfg, robot=LEGS)
+    cfg.primary.pattern = ("left_foot", "right_foot")
+    with pytest.raises(ValueError, match="secondary pattern: expected at least one name"):
+        compose(cfg, robot=LEGS)
+    assert cfg.secondary is not None
+    cfg.secondary.pattern = "trunk_collision"
+    feet = ["robot/left_foot", "robot/right_foot"]
+    assert elements(compose(cfg, robot=LEGS)) == [(foot, "robot/trunk_collision") for foot in feet]
 
 
 def test_two_sensors_of_one_name_are_refused():

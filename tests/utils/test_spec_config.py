@@ -78,11 +78,29 @@ def test_a_collision_setup_can_leave_other_geoms_alone(spec):
     assert spec.compile().geom_contype.tolist() == [2, 2, 1, 1]
 
 
-@pytest.mark.parametrize("field", ["contype", "conaffinity", "condim", "priority"])
-def test_a_required_dict_must_cover_every_geom(spec, field):
-    values = {**REQUIRED, field: {"foot_left": 1}}
-    with pytest.raises(ValueError, match=rf"{field} has no pattern .*\['foot_right'\]"):
-        CollisionCfg(geom_names_expr=("foot",), **values).edit_spec(spec)
+def test_geoms_that_no_pattern_names_get_the_defaults_of_earlier_releases_with_one_warning(spec):
+    for geom in spec.geoms:
+        geom.condim, geom.priority, geom.contype, geom.conaffinity = 6, 2, 4, 8
+    partial = {"foot_left": 4}
+    cfg = CollisionCfg(
+        (".*",), contype=partial, conaffinity=partial, condim=partial, priority=partial
+    )
+    with pytest.warns(FutureWarning, match=r"no pattern matches.*'foot_right'.*\.\*") as record:
+        cfg.edit_spec(spec)
+        cfg.edit_spec(spec)
+    assert len(record) == 1
+    model = spec.compile()
+    assert model.geom_condim.tolist() == [4, 3, 3, 3]
+    assert model.geom_priority.tolist() == [4, 0, 0, 0]
+    assert model.geom_contype.tolist() == [4, 1, 1, 1]
+    assert model.geom_conaffinity.tolist() == [4, 1, 1, 1]
+
+
+def test_edits_that_a_fallback_overwrites_are_reported(spec):
+    geom = GeomCfg(geom_names_expr=("foot_right",), condim=1)
+    collision = CollisionCfg((".*",), **{**REQUIRED, "condim": {"foot_left": 4}})
+    with pytest.warns(UserWarning, match=r"foot_right\.condim"):
+        warn_overlapping_geom_edits([geom], [collision], spec)
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 C = TypeVar("C", bound=type)
+T = TypeVar("T")
 
 # Where an older name lives today, as "module:name".
 _EVENTS = {
@@ -271,6 +272,22 @@ _DROPPED_FIELDS: dict[str, dict[str, tuple[str, _Translation | None]]] = {
 # MuJoCo features that earlier releases had to enable and today's has on.
 ALWAYS_ENABLED_FLAGS = frozenset({"multiccd"})
 _LOOSE_DEFAULTS: dict[str, dict[str, Any]] = {"CollisionCfg": _REQUIRED_BEFORE_1_6}
+# Methods that subclasses override and that once took fewer arguments: the argument that an older
+# override lacks, and the function that calls it with today's arguments, as "module:function".
+_OLDER_METHODS: dict[str, dict[str, tuple[str, str]]] = {
+    "CommandTerm": {
+        "_update_command": ("env_ids", "mjlab.compat.older_terms:update_command"),
+        "compute": ("env_ids", "mjlab.compat.older_terms:compute"),
+        "create_gui": ("on_change", "mjlab.compat.older_terms:create_gui"),
+    },
+}
+# Terms that read sites of `asset_cfg` before they read a sensor: the parameter that names the
+# sensor today, and the term for calls without it, as "module:name".
+_OLDER_PARAMS: dict[str, tuple[str, str]] = {
+    "foot_height": ("sensor_name", "mjlab.compat.older_terms:foot_height"),
+    "feet_clearance": ("height_sensor_name", "mjlab.compat.older_terms:feet_clearance"),
+    "feet_swing_height": ("height_sensor_name", "mjlab.compat.older_terms:feet_swing_height"),
+}
 
 
 _OLDER = "mjlab.compat.older"
@@ -383,6 +400,127 @@ def accepts_older_fields(config_class: C) -> C:
 
     cls.__init__ = __init__
     return config_class
+
+
+def older_defaults(config_class: type, missing: dict[str, list[str]]) -> dict[str, Any]:
+    """Return the values of fields that a dict by pattern leaves open, and warn once if any is.
+
+    Args:
+        config_class: The config.
+        missing: By field, the elements that none of its patterns matches.
+    """
+    defaults = _LOOSE_DEFAULTS[config_class.__name__]
+    gaps = [
+        f"{name} of {names[:8]}{' and others' if len(names) > 8 else ''} is {defaults[name]}"
+        for name, names in missing.items()
+        if names
+    ]
+    if gaps:
+        _warn_once(
+            f"{config_class.__name__}: no pattern matches some elements, so {', '.join(gaps)}. "
+            "Today patterns cover all; add a last pattern '.*'."
+        )
+    return defaults
+
+
+def accept_older_methods(base: type, subclass: type) -> None:
+    """Make methods of `subclass` callable as those of `base` are today.
+
+    `base` calls it from `__init_subclass__`. An override in the spelling of an earlier release is
+    replaced by a method that takes today's arguments and calls it.
+    """
+    for name, (argument, caller) in _OLDER_METHODS[base.__name__].items():
+        method = getattr(subclass, name)
+        position = list(inspect.signature(getattr(base, name)).parameters).index(argument)
+        if inspect.isfunction(method) and not _takes(method, argument, position):
+            setattr(subclass, name, _called_as_today(method, argument, caller))
+
+
+def _takes(method: Callable[..., Any], argument: str, position: int) -> bool:
+    """Return whether a method takes an argument by position, under that name or as a required one."""
+    parameters = inspect.signature(method).parameters.values()
+    if any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters):
+        return True
+    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    required = [p for p in positional if p.default is p.empty]
+    return len(required) > position or any(p.name == argument for p in positional)
+
+
+def _called_as_today(method: Any, argument: str, caller: str) -> Callable[..., Any]:
+    message = f"{method.__qualname__} takes no {argument}, as in an earlier release; today it does."
+
+    @functools.wraps(method)
+    def older(*args: Any, **kwargs: Any) -> Any:
+        _warn_once(message)
+        return _load(caller)(method, *args, **kwargs)
+
+    # Signatures are read from what is wrapped, and a subclass must see that this takes everything.
+    del older.__wrapped__
+    return older
+
+
+def accepts_older_params(term: T) -> T:
+    """Decorator for terms, functions or classes: take sites in `asset_cfg` instead of a sensor.
+
+    A call (or, for a class, a config) with `asset_cfg` and without the sensor goes to the older term.
+    """
+    cls: Any = term
+    name = cls.__name__
+    sensor, path = _OLDER_PARAMS[name]
+
+    def is_older(params: dict[str, Any]) -> bool:
+        older = not isinstance(params.get(sensor), str) and bool(
+            {"asset_cfg", sensor} & params.keys()
+        )
+        if older:
+            _warn_once(
+                f"{name} without {sensor} takes the heights of sites above z = 0, as in releases "
+                f"1.1 and 1.2; today it takes {sensor}."
+            )
+        return older
+
+    if inspect.isclass(term):
+        # Python initializes what `__new__` returns as what it is: the older term is a subclass.
+        def __new__(today: type, cfg: Any, env: Any) -> Any:
+            return object.__new__(_load(path) if today is cls and is_older(cfg.params) else today)
+
+        cls.__new__ = __new__
+        return term
+    either: Any = _either(cls, lambda: _load(path), is_older)
+    either.__signature__ = _with_either(inspect.signature(cls), sensor)
+    return either
+
+
+def _either(
+    today: Any, load_older: Callable[[], Any], is_older: Callable[[dict[str, Any]], bool]
+) -> Any:
+    """Return a function that calls one of two, with their check of parameters where they have one."""
+    signature = inspect.signature(today)
+
+    @functools.wraps(today)
+    def term(*args: Any, **kwargs: Any) -> Any:
+        given = dict(zip(signature.parameters, args, strict=False)) | kwargs
+        return (load_older() if is_older(given) else today)(*args, **kwargs)
+
+    if hasattr(today, "check_when_built"):
+        term.check_when_built = _either(  # ty: ignore
+            today.check_when_built, lambda: load_older().check_when_built, is_older
+        )
+    return term
+
+
+def _with_either(signature: inspect.Signature, sensor: str) -> inspect.Signature:
+    """Return a signature that takes `sensor` or `asset_cfg`."""
+    parameters = dict(signature.parameters)
+    parameters[sensor] = parameters[sensor].replace(default=None)
+    keyword_only = inspect.Parameter.KEYWORD_ONLY
+    parameters.setdefault("asset_cfg", inspect.Parameter("asset_cfg", keyword_only, default=None))
+    return signature.replace(parameters=list(parameters.values()))
+
+
+def _load(path: str) -> Any:
+    home, _, name = path.partition(":")
+    return getattr(importlib.import_module(home), name)
 
 
 def set_array_field(field: Any, values: Any) -> None:

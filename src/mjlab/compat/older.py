@@ -12,7 +12,7 @@ import tempfile
 import time
 from abc import ABCMeta
 from collections.abc import Iterator, MutableMapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
@@ -39,32 +39,31 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-class DelayedActuatorCfg:
-    """`DelayedActuatorCfg(base_cfg=..., delay_max_lag=...)` returns `base_cfg` with these delays.
+@dataclass(kw_only=True)
+class DelayedActuatorCfg(ActuatorCfg):
+    """A delay around another actuator config; today every config takes the delay itself.
 
-    Today every actuator config takes `delay_min_lag` and so on itself. The whole command is
-    delayed, whichever part `delay_target` names.
+    Targets and passive properties are those of `base_cfg`. The whole command is delayed, whichever
+    part `delay_target` names.
     """
 
-    def __new__(  # type: ignore[misc]
-        cls,
-        *,
-        base_cfg: ActuatorCfg,
-        delay_target: Any = "position",
-        delay_min_lag: int = 0,
-        delay_max_lag: int = 1,
-        delay_hold_prob: float = 0.0,
-        delay_update_period: int = 0,
-        delay_per_env_phase: bool = True,
-    ) -> ActuatorCfg:
-        return dataclasses.replace(
-            base_cfg,
-            delay_min_lag=delay_min_lag,
-            delay_max_lag=delay_max_lag,
-            delay_hold_prob=delay_hold_prob,
-            delay_update_period=delay_update_period,
-            delay_per_env_phase=delay_per_env_phase,
-        )
+    target_names_expr: tuple[str, ...] = field(default=(), init=False)
+    """Those of `base_cfg`."""
+    base_cfg: ActuatorCfg
+    """The actuator to delay."""
+    delay_target: Any = "position"
+    """Not used."""
+
+    def __post_init__(self) -> None:
+        self.target_names_expr = self.base_cfg.target_names_expr
+        self.transmission_type = self.base_cfg.transmission_type
+        super().__post_init__()
+
+    def build(self, entity: Entity, target_ids: list[int], target_names: list[str]) -> Actuator:
+        """Build the actuator of `base_cfg` with this delay."""
+        delay = {name: getattr(self, name) for name in vars(self) if name.startswith("delay_")}
+        del delay["delay_target"]
+        return dataclasses.replace(self.base_cfg, **delay).build(entity, target_ids, target_names)
 
 
 class _HasDelay(ABCMeta):

@@ -129,10 +129,15 @@ def _merge_assets(names: list[str], specs: list[mujoco.MjSpec]) -> Assets:
 def _rename_own(spec: mujoco.MjSpec, prefix: str) -> None:
     """Rename the assets of a spec, and all references to them."""
     for kind in _COPY:
-        for asset in getattr(spec, kind):
-            asset.name = prefix + asset.name
-    for material in spec.materials:
-        material.textures = [prefix + name if name else name for name in material.textures]
+        for asset in list(getattr(spec, kind)):
+            if kind == "materials":
+                # Once compiled, a material keeps the names of its textures, so it is replaced.
+                renamed = spec.add_material(name=prefix + asset.name)
+                copy_material_data(asset, renamed)
+                renamed.textures = [prefix + name if name else name for name in asset.textures]
+                spec.delete(asset)
+            else:
+                asset.name = prefix + asset.name
     for user in (*spec.geoms, *spec.sites, *spec.tendons, *spec.skins, *spec.flexes, *spec.meshes):
         if user.material:
             user.material = prefix + user.material

@@ -26,7 +26,8 @@ def build_actuators(entity: Entity) -> list[Actuator]:
 
     Raises:
         ValueError: the patterns of a config do not resolve, with the reason and the candidates; or
-            what they match has an actuator already, of another config or of the XML.
+            what they match has an actuator already, of another config, or of the XML with the name
+            that the new one gets. Other actuators of the XML stay, with a warning: both act.
     """
     articulation = entity.cfg.articulation
     if articulation is None:
@@ -35,7 +36,7 @@ def build_actuators(entity: Entity) -> list[Actuator]:
     for cfg in articulation.actuators:
         ids, names = _find_targets(entity, cfg)
         built.append((cfg.build(entity, ids, names), ids))
-    _refuse_second_actuators(entity, built)
+    _check_second_actuators(entity, built)
     if entity.cfg.sort_actuators:
         _add_sorted(entity, built)
     else:
@@ -50,33 +51,53 @@ def _wraps_xml(actuator: Actuator) -> bool:
     return isinstance(actuator.cfg, XmlActuatorCfg)
 
 
-def _refuse_second_actuators(entity: Entity, built: list[tuple[Actuator, list[int]]]) -> None:
-    """Raise if two would act on the same joint, tendon or site, adding up their forces."""
+def _check_second_actuators(entity: Entity, built: list[tuple[Actuator, list[int]]]) -> None:
+    """Warn if a config adds an actuator to a target that has one of the XML: their forces add up.
+
+    Raises:
+        ValueError: two configs act on one target, or the actuators would have the same name.
+    """
     in_xml = {
-        (transmission, element.target): f"the actuator {element.name or '(unnamed)'!r} of the XML"
+        (transmission, element.target): element.name
         for element in entity.spec.actuators
         for transmission, kinds in XML_TRANSMISSIONS.items()
         if element.trntype in kinds
     }
-    claimed: dict[tuple[TransmissionType, str], str] = {}
+    claimed: dict[tuple[bool, TransmissionType, str], str] = {}
     for actuator, ids in built:
         cfg, kind = actuator.cfg, actuator.transmission_type
         wraps = _wraps_xml(actuator)
-        keys = [(kind, _elements(entity, kind)[index].name) for index in ids]
+        label = f"{type(cfg).__name__}({cfg.target_names_expr!r})"
+        names = [_elements(entity, kind)[index].name for index in ids]
         # One that wraps those of the XML leaves out what has none.
-        keys = [key for key in keys if key in in_xml or not wraps]
-        taken = {key: claimed[key] for key in keys if key in claimed}
-        if not wraps:
-            taken |= {key: in_xml[key] for key in keys if key in in_xml}
+        names = [name for name in names if (kind, name) in in_xml or not wraps]
+        taken = {
+            n: f"one by {claimed[wraps, kind, n]}" for n in names if (wraps, kind, n) in claimed
+        }
+        beside = {
+            name: f"the actuator {in_xml[kind, name] or '(unnamed)'!r} of the XML"
+            for name in names
+            if not wraps and (kind, name) in in_xml
+        }
+        taken |= {name: by for name, by in beside.items() if in_xml[kind, name] == name}
+        message = f"{label} acts on {kind.value}s that have an actuator already: "
         if taken:
-            found = ", ".join(f"{short_name(name)!r} has {by}" for (_, name), by in taken.items())
             raise ValueError(
-                f"{type(cfg).__name__}(target_names_expr={cfg.target_names_expr!r}) acts on "
-                f"{kind.value}s that have an actuator already: {found}. Give each one actuator: "
-                "narrow the patterns, remove the actuator from the XML, or use it as it is there, "
-                "by XmlActuatorCfg alone."
+                f"{message}{_list_taken(taken)}. Give each one actuator: narrow the patterns, remove "
+                "the actuator from the XML, or use it as it is there, by XmlActuatorCfg alone."
             )
-        claimed |= dict.fromkeys(keys, f"one by {type(cfg).__name__}({cfg.target_names_expr!r})")
+        if beside:
+            warnings.warn(
+                f"{message}{_list_taken(beside)}. Both act, and their forces add up. If that is not "
+                "meant, remove the actuator from the XML.",
+                UserWarning,
+                stacklevel=2,
+            )
+        claimed |= dict.fromkeys(((wraps, kind, name) for name in names), label)
+
+
+def _list_taken(taken: dict[str, str]) -> str:
+    return ", ".join(f"{short_name(name)!r} has {by}" for name, by in taken.items())
 
 
 def _add(entity: Entity, actuator: Actuator, ids: list[int]) -> None:

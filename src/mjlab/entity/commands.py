@@ -118,19 +118,19 @@ class EntityCommands:
         joint_ids: Ids = None,
         env_ids: EnvIds = None,
     ) -> None:
-        """Write joint positions and velocities (k, number of joints)."""
+        """Write joint positions and velocities (k, number of joints); (k, 1) for all joints alike."""
         self.data.write_joint_state(position, velocity, joint_ids, env_ids)
 
     def write_joint_position_to_sim(
         self, position: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Write joint positions (k, number of joints)."""
+        """Write joint positions (k, number of joints); (k, 1) for all joints alike."""
         self.data.write_joint_position(position, joint_ids, env_ids)
 
     def write_joint_velocity_to_sim(
         self, velocity: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Write joint velocities (k, number of joints)."""
+        """Write joint velocities (k, number of joints); (k, 1) for all joints alike."""
         self.data.write_joint_velocity(velocity, joint_ids, env_ids)
 
     def write_external_wrench_to_sim(
@@ -173,5 +173,5 @@ def _set_target(
         if columns.dtype == torch.bool:
             columns = columns.nonzero().flatten()
         width = columns.shape[0]
-    check_width(value, width, f"The {what} target")
+    check_width(value, width, f"The {what} target", broadcasts=True)
     assign(target, value, env_ids, columns)

@@ -36,9 +36,13 @@ def rows(field: torch.Tensor, env_ids: EnvIds) -> torch.Tensor:
     return field if env_ids is None else field[env_ids]
 
 
-def check_width(value: Any, width: int, what: str) -> None:
-    """Raise `ValueError` unless the last dimension of a tensor `value` is `width`."""
-    if isinstance(value, torch.Tensor) and value.ndim > 0 and value.shape[-1] != width:
+def check_width(value: Any, width: int, what: str, broadcasts: bool = False) -> None:
+    """Raise `ValueError` unless the last dimension of a tensor `value` is `width`.
+
+    With `broadcasts` it may be 1: one value for all elements.
+    """
+    widths = (1, width) if broadcasts else (width,)
+    if isinstance(value, torch.Tensor) and value.ndim > 0 and value.shape[-1] not in widths:
         raise ValueError(
             f"{what} has {value.shape[-1]} values per environment (shape {tuple(value.shape)}), "
             f"but {width} are to be written. Give a tensor of shape (number of envs, {width})."
@@ -135,34 +139,34 @@ class StateWriter:
         joint_ids: Ids = None,
         env_ids: EnvIds = None,
     ) -> None:
-        """Write joint positions and velocities, (k, number of joints) each."""
+        """Write joint positions and velocities, (k, number of joints) or (k, 1) each."""
         self.write_joint_position(position, joint_ids, env_ids)
         self.write_joint_velocity(velocity, joint_ids, env_ids)
 
     def write_joint_position(
         self, position: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Write joint positions, (k, number of joints).
+        """Write joint positions, (k, number of joints) or (k, 1).
 
         Raises:
             ValueError: the entity has no joints, or the width is wrong.
         """
         self._require_articulated("write_joint_position")
         columns, width = self._joint_q.select(joint_ids)
-        check_width(position, width, "The joint position")
+        check_width(position, width, "The joint position", broadcasts=True)
         assign(self.data.qpos, position, env_ids, columns)
 
     def write_joint_velocity(
         self, velocity: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Write joint velocities, (k, number of joints).
+        """Write joint velocities, (k, number of joints) or (k, 1).
 
         Raises:
             ValueError: the entity has no joints, or the width is wrong.
         """
         self._require_articulated("write_joint_velocity")
         columns, width = self._joint_v.select(joint_ids)
-        check_width(velocity, width, "The joint velocity")
+        check_width(velocity, width, "The joint velocity", broadcasts=True)
         assign(self.data.qvel, velocity, env_ids, columns)
 
     def write_external_wrench(
@@ -196,7 +200,7 @@ class StateWriter:
                 "EntityCfg.articulation.actuators."
             )
         columns, width = self._ctrl.select(ctrl_ids)
-        check_width(ctrl, width, "The control")
+        check_width(ctrl, width, "The control", broadcasts=True)
         assign(self.data.ctrl, ctrl, env_ids, columns)
 
     def write_mocap_pose(self, pose: torch.Tensor, env_ids: EnvIds = None) -> None:

@@ -307,10 +307,14 @@ def build_variant_model(
         nworld: Number of worlds.
         variant_info: Name and variants of each entity that has some.
         configure_model: Changes the compiled model before it is put on the device.
+
+    Raises:
+        ValueError: the spec does not compile, with MuJoCo's message.
     """
     from mjlab.sim.engines.warp import put_variant_model
+    from mjlab.sim.simulation import compile_spec
 
-    model = spec.compile()
+    model = compile_spec(spec)
     if configure_model is not None:
         configure_model(model)
     info: list[tuple[str, VariantInfo]] = list(variant_info)

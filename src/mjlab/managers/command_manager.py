@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.compat import accept_older_methods
 from mjlab.managers.built_terms import BuiltTermsManager
 from mjlab.managers.debug_vis import DebugVisSwitches
 from mjlab.managers.env_ids import as_ids, is_empty
@@ -52,9 +52,12 @@ class CommandTerm(ManagerTermBase):
         command_counter: Number of commands in this episode, (num_envs,) int64.
         metrics: Name to values (num_envs,); their means are logged at resets, then zeroed.
 
-    Raises `TypeError` if `_update_command` takes no `env_ids`, and `ValueError` if the config's
-    time range is negative or turned round.
+    Raises `ValueError` if the config's time range is negative or turned round.
     """
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        accept_older_methods(CommandTerm, cls)
 
     def __init__(self, cfg: CommandTermCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(env)
@@ -153,7 +156,7 @@ class CommandTerm(ManagerTermBase):
         """Draw commands for these environments (1-D int64)."""
         raise NotImplementedError(f"{self.name} must define _resample_command(env_ids).")
 
-    def _update_command(self, env_ids: torch.Tensor | None) -> None:
+    def _update_command(self, env_ids: torch.Tensor | None = None) -> None:
         """Update commands that depend on the state; None means all environments."""
 
     def _update_metrics(self) -> None:
@@ -176,13 +179,6 @@ class CommandTerm(ManagerTermBase):
             self.metrics[name] = values.copy_(kept)
 
     def _check(self) -> None:
-        parameters = inspect.signature(self._update_command).parameters.values()
-        if not any(p.name == "env_ids" or p.kind is p.VAR_KEYWORD for p in parameters):
-            raise TypeError(
-                f"{self.name}._update_command must take env_ids: a tensor of the environments "
-                "to update after a reset, or None for all. Change it to "
-                "`def _update_command(self, env_ids: torch.Tensor | None) -> None`."
-            )
         low, high = self.cfg.resampling_time_range
         if not 0.0 <= low <= high:
             raise ValueError(

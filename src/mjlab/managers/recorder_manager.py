@@ -30,7 +30,10 @@ class RecorderTerm(ManagerTermBase):
         self.cfg = cfg
 
     def __call__(self) -> None:
-        """Do nothing: recorders have hooks instead."""
+        """Raise `NotImplementedError`: recorders have hooks instead."""
+        raise NotImplementedError(
+            f"{self.name} is not called; override its hooks, such as record_post_step."
+        )
 
     def record_pre_reset(self, env_ids: torch.Tensor) -> None:
         """Look at environments that are about to reset.

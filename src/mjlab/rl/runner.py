@@ -22,6 +22,7 @@ from mjlab.rl.checkpoint import (
     save_checkpoint,
 )
 from mjlab.rl.distributed import join_processes
+from mjlab.rl.divergence import SpeedWatch
 from mjlab.rl.evaluate import reward_unit
 from mjlab.rl.evaluation_result import EvaluationResult
 from mjlab.rl.exporter_utils import attach_metadata_to_onnx, get_base_metadata
@@ -122,6 +123,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             env, self.alg, self.cfg.get("evaluation") or {}, int(self.cfg.get("seed", 0))
         )
         self._num_threads = self._resolve_threads()
+        self._speeds = SpeedWatch(env.unwrapped)
 
     # The training loop.
 
@@ -140,6 +142,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         Raises:
             RunFolderError: the run folder cannot be written to; raised before any training.
             CheckpointError: a checkpoint could not be written.
+            DivergedError: training failed because the physics of a joint diverged.
             ValueError: the environment returned NaN, or Weights & Biases started no run.
         """
         first = self.current_learning_iteration
@@ -183,11 +186,12 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         first = self.current_learning_iteration
         for iteration in range(first, total):
             begin = time.perf_counter()
-            with torch.inference_mode():
-                observations = self._collect(observations)
-                collected = time.perf_counter()
-                self.alg.compute_returns(observations)
-            losses = self.alg.update()
+            with self._speeds.explaining(self.alg.get_policy()):
+                with torch.inference_mode():
+                    observations = self._collect(observations)
+                    collected = time.perf_counter()
+                    self.alg.compute_returns(observations)
+                losses = self.alg.update()
             learned = time.perf_counter()
             self._observations = observations
             self.current_learning_iteration = iteration + 1
@@ -204,9 +208,11 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     def _collect(self, observations: TensorDict) -> TensorDict:
         """Step all environments `num_steps_per_env` times; return the last observations."""
         check_every_step = self.cfg.get("check_for_nan", True)
+        self._speeds.start()
         for _ in range(self.cfg["num_steps_per_env"]):
             actions = self.alg.act(observations)
             observations, rewards, dones, extras = self.env.step(actions.to(self.env.device))
+            self._speeds.update()
             if check_every_step:
                 check_nan(observations, rewards, dones)
             observations = observations.to(self.device)

@@ -49,10 +49,12 @@ def find_matches(
     Elements of an entity come in the order of the spec, names of the scene in the order given.
 
     Raises:
-        ValueError: no such entity; a pattern that matches nothing (with names that are close); a
-            name that two patterns match; everything excluded.
+        ValueError: no such entity; no pattern, or an empty one; a pattern that matches nothing
+            (with names that are close); a name that two patterns match; everything excluded.
     """
     where = f"Contact sensor {sensor!r}: {role}"
+    if not match.patterns or "" in match.patterns:
+        raise ValueError(f"{where} pattern: expected at least one name, got {match.pattern!r}.")
     if not match.entity:
         return _find_literal(where, match, scene_spec)
     if match.entity not in entities:

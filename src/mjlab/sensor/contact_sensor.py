@@ -44,7 +44,7 @@ class ContactMatch:
     pattern: str | tuple[str, ...]
     """With `entity`: regular expressions that must match a whole name in the entity. A name inside
     an attached part, such as `left/elbow`, is matched as `left/elbow` and as `elbow`. Without
-    `entity`: full names in the scene, taken literally."""
+    `entity`: full names in the scene, taken literally. It may be empty until the scene is built."""
     entity: str | None = None
     """The entity, `terrain` included; None looks in the whole scene."""
     exclude: tuple[str, ...] = ()
@@ -56,8 +56,6 @@ class ContactMatch:
             raise ValueError(
                 f"ContactMatch.mode is {self.mode!r}; choose from: {', '.join(get_args(MatchMode))}."
             )
-        if not self.patterns or "" in self.patterns:
-            raise ValueError(f"ContactMatch.pattern is {self.pattern!r}; it must name something.")
 
     @property
     def patterns(self) -> tuple[str, ...]:
@@ -76,7 +74,7 @@ class ContactSensorCfg(SensorCfg):
     primary: ContactMatch
     """Whose contacts are sensed: each element that matches is one primary."""
     secondary: ContactMatch | None = None
-    """What they have to be with, one pattern; None for anything."""
+    """What they have to be with: one element, see `secondary_policy`; None for anything."""
     fields: tuple[str, ...] = ("found", "force")
     """What to measure, of: found, force, torque, dist, pos, normal, tangent."""
     reduce: Reduction = "maxforce"
@@ -85,7 +83,7 @@ class ContactSensorCfg(SensorCfg):
     num_slots: int = 1
     """Contacts reported for each primary."""
     secondary_policy: SecondaryPolicy = "first"
-    """If the secondary pattern matches several elements: take the `first`, ignore the secondary and
+    """If the secondary patterns match several elements: take the `first`, ignore the secondary and
     sense contacts with `any`thing, or raise an `error`."""
     track_air_time: bool = False
     """Measure how long each primary has been in contact and in the air. Needs the field found."""
@@ -110,8 +108,6 @@ class ContactSensorCfg(SensorCfg):
             self._refuse(f"history_length={self.history_length} must not be negative")
         if self.track_air_time and "found" not in self.fields:
             self._refuse("track_air_time=True needs 'found' among the fields")
-        if self.secondary is not None and len(self.secondary.patterns) != 1:
-            self._refuse(f"secondary.pattern={self.secondary.pattern!r} must be one string")
         self._check_global_frame()
 
     def _check_global_frame(self) -> None:

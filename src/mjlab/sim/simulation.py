@@ -74,7 +74,7 @@ class Simulation:
         self.num_envs = num_envs
         self.cfg = cfg
         self.device = device
-        self._mj_model = _compile(spec) if spec is not None else model
+        self._mj_model = compile_spec(spec) if spec is not None else model
         assert self._mj_model is not None
         cfg.mujoco.apply(self._mj_model)
         self._mj_data = mujoco.MjData(self._mj_model)
@@ -422,8 +422,12 @@ class Simulation:
         return torch.unique(env_ids.to(self.device, torch.int64), sorted=True)
 
 
-def _compile(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile `spec` so that inertial frames may differ between environments afterwards."""
+def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile `spec` so that inertial frames may differ between environments afterwards.
+
+    Raises:
+        ValueError: the spec does not compile, with MuJoCo's message.
+    """
     for body in spec.bodies:
         # The compiler's shortcut for free bodies fixes the sparsity of the mass matrix, which a
         # randomized centre of mass would need in full.

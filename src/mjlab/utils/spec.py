@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import mujoco
@@ -72,7 +72,9 @@ def copy_mesh_data(src: mujoco.MjsMesh, dst: mujoco.MjsMesh) -> None:
 
 def copy_texture_data(src: mujoco.MjsTexture, dst: mujoco.MjsTexture) -> None:
     """Copy everything but the name. `ValueError` if `dst` has no name yet."""
-    _copy_data(src, dst)
+    # Compiling keeps the pixels of a file in `data`, but not their number.
+    is_read = src.file or any(src.cubefiles)
+    _copy_data(src, dst, leave_out=("data",) if is_read else ())
 
 
 def copy_material_data(src: mujoco.MjsMaterial, dst: mujoco.MjsMaterial) -> None:
@@ -80,14 +82,14 @@ def copy_material_data(src: mujoco.MjsMaterial, dst: mujoco.MjsMaterial) -> None
     _copy_data(src, dst)
 
 
-def _copy_data(src: Any, dst: Any) -> None:
+def _copy_data(src: Any, dst: Any, leave_out: Collection[str] = ()) -> None:
     if not dst.name:
         raise ValueError(
             f"The {type(dst).__name__} to copy {src.name!r} into has no name. "
             "Name it first: names must be unique in a spec, so they are not copied."
         )
     for field in dir(src):
-        if field.startswith("_") or field in _NOT_DATA:
+        if field.startswith("_") or field in _NOT_DATA or field in leave_out:
             continue
         value = getattr(src, field)
         if callable(value) or (field == "plugin" and not value.active):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,6 +15,7 @@ import torch
 from tracking_tasks import G1, G1_BLIND, part_of
 
 from mjlab.envs import ManagerBasedRlEnv
+from mjlab.managers import CommandTerm, CommandTermCfg
 from mjlab.rl import RslRlVecEnvWrapper
 from mjlab.rl.onnx_policy import OnnxPolicyError, load_onnx_policy
 from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
@@ -199,3 +200,115 @@ def test_a_task_without_motion_is_refused():
     with pytest.raises(ValueError, match="needs a MotionCommand"):
         MotionTrackingOnPolicyRunner(RslRlVecEnvWrapper(env), rl_cfg)
     env.close()
+
+
+@dataclass(kw_only=True)
+class OwnMotionCfg(CommandTermCfg):
+    """The config of a package's own motion command."""
+
+    entity_name: str = "robot"
+    anchor_body_name: str = "torso_link"
+    body_names: tuple[str, ...] = ()
+
+    def build(self, env):
+        return OwnMotion(self, env)
+
+
+class OwnMotion(CommandTerm):
+    """Another class than `MotionCommand`: its reference is the robot as it stands."""
+
+    def __init__(self, cfg, env):
+        super().__init__(cfg, env)
+        self.robot = env.scene[cfg.entity_name]
+        self.ids = [self.robot.body_names.index(name) for name in cfg.body_names]
+        self.anchor = self.robot.body_names.index(cfg.anchor_body_name)
+        self.body_pos_relative_w = torch.zeros(env.num_envs, len(self.ids), 3)
+        self.body_quat_relative_w = torch.zeros(env.num_envs, len(self.ids), 4)
+        self.body_quat_relative_w[..., 0] = 1.0
+
+    @property
+    def command(self):
+        return torch.cat((self.robot.data.joint_pos, self.robot.data.joint_vel), dim=1)
+
+    @property
+    def robot_anchor_pos_w(self):
+        return self.robot.data.body_link_pos_w[:, self.anchor]
+
+    @property
+    def robot_anchor_quat_w(self):
+        return self.robot.data.body_link_quat_w[:, self.anchor]
+
+    anchor_pos_w, anchor_quat_w = robot_anchor_pos_w, robot_anchor_quat_w
+
+    @property
+    def robot_body_pos_w(self):
+        return self.robot.data.body_link_pos_w[:, self.ids]
+
+    @property
+    def robot_body_quat_w(self):
+        return self.robot.data.body_link_quat_w[:, self.ids]
+
+    @property
+    def robot_body_lin_vel_w(self):
+        return self.robot.data.body_link_lin_vel_w[:, self.ids]
+
+    body_lin_vel_w = robot_body_lin_vel_w
+
+    @property
+    def robot_body_ang_vel_w(self):
+        return self.robot.data.body_link_ang_vel_w[:, self.ids]
+
+    body_ang_vel_w = robot_body_ang_vel_w
+
+    def _resample_command(self, env_ids):
+        pass
+
+    def _update_command(self, env_ids=None):
+        self.body_pos_relative_w.copy_(self.robot_body_pos_w)
+        self.body_quat_relative_w.copy_(self.robot_body_quat_w)
+
+
+def to_own_motion(cfg):
+    ours = cfg.commands["motion"]
+    cfg.commands["motion"] = OwnMotionCfg(
+        resampling_time_range=(10.0, 10.0), body_names=tuple(ours.body_names)
+    )
+    cfg.terminations = {"time_out": cfg.terminations["time_out"]}
+    cfg.curriculum = {}
+
+
+def test_any_command_named_motion_trains_with_the_terms_of_tracking(make_runner, tmp_path):
+    runner = make_runner(tmp_path / "run", motion=None, edit=to_own_motion, num_envs=2)
+    assert isinstance(runner.motion_command, OwnMotion)
+    runner.learn(1)
+    env = runner.env.unwrapped
+    # The reference is the robot, as it was when the command was last updated.
+    for name in ("motion_body_pos", "motion_body_ori"):
+        index = env.reward_manager.active_terms.index(name)
+        assert env.reward_manager.get_active_iterable_terms(0)[index][1][0] > 0.0
+    assert (tmp_path / "run" / "run.onnx").is_file()
+    assert not (tmp_path / "run" / "motion").exists()
+    assert runner.onnx_metadata()["anchor_body_name"] == "torso_link"
+    runner.load(str(tmp_path / "run" / "model_0.pt"))
+
+
+def test_a_term_that_lacks_what_a_motion_command_has_is_named(make_env):
+    class Bare(OwnMotion):
+        anchor_pos_w = property()
+
+        def __dir__(self):
+            return [name for name in super().__dir__() if name != "anchor_pos_w"]
+
+    @dataclass(kw_only=True)
+    class BareCfg(OwnMotionCfg):
+        def build(self, env):
+            return Bare(self, env)
+
+    def edit(cfg):
+        to_own_motion(cfg)
+        cfg.commands["motion"] = BareCfg(**vars(cfg.commands["motion"]))
+
+    with pytest.raises(
+        TypeError, match="'motion': expected a MotionCommand.* without anchor_pos_w"
+    ):
+        make_env(None, edit=edit)

@@ -9,7 +9,7 @@ from typing import Any
 
 import mujoco
 
-from mjlab.compat import accepts_older_fields, set_array_field
+from mjlab.compat import accepts_older_fields, older_defaults, set_array_field
 from mjlab.utils.spec_editors.base import SpecCfg, check_values
 from mjlab.utils.string import filter_exp, resolve_field
 
@@ -70,7 +70,8 @@ class GeomCfg(SpecCfg):
 class CollisionCfg(SpecCfg):
     """The collision setup of an entity. Values are given as in `GeomCfg`.
 
-    The four required attributes are always written, so dicts must cover every geom chosen; the
+    The four required attributes are always written, so dicts should cover every geom chosen; what
+    no pattern names gets contype 1, conaffinity 1, condim 3 or priority 0, with a warning. The
     others are patches.
     """
 
@@ -101,19 +102,13 @@ class CollisionCfg(SpecCfg):
     set_array_field = staticmethod(set_array_field)
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Write the setup. Raises `ValueError` if a value is not valid or missing for a geom."""
+        """Write the setup. Raises `ValueError` if a value is not valid."""
         self.validate()
         geoms = _matched_geoms(spec, self.geom_names_expr)
-        names = tuple(geom.name for geom in geoms)
-        for field in _REQUIRED:
-            values = resolve_field(getattr(self, field), names)
-            missing = [name for name, value in zip(names, values, strict=True) if value is None]
-            if missing:
-                raise ValueError(
-                    f"CollisionCfg.{field} has no pattern that matches the geoms {missing}. Its "
-                    f"patterns are {list(getattr(self, field))}; add one, or a last pattern '.*'."
-                )
-        for field in (*_REQUIRED, *_PATCHES):
+        for field, values in self._required_values([geom.name for geom in geoms]).items():
+            for geom, value in zip(geoms, values, strict=True):
+                setattr(geom, field, value)
+        for field in _PATCHES:
             _patch(geoms, field, getattr(self, field))
         if self.disable_other_geoms:
             for geom in _other_geoms(spec, self.geom_names_expr):
@@ -125,6 +120,19 @@ class CollisionCfg(SpecCfg):
             if getattr(self, field) is None:
                 raise ValueError(f"CollisionCfg.{field} is None; it must have a value.")
         _validate_collision(self)
+
+    def _required_values(self, names: Sequence[str]) -> dict[str, list[Any]]:
+        """Return the required attributes of the geoms `names`, by field."""
+        found = {field: resolve_field(getattr(self, field), tuple(names)) for field in _REQUIRED}
+        missing = {
+            field: [name for name, value in zip(names, values, strict=True) if value is None]
+            for field, values in found.items()
+        }
+        defaults = older_defaults(type(self), missing)
+        return {
+            field: [defaults[field] if value is None else value for value in values]
+            for field, values in found.items()
+        }
 
 
 def _validate_collision(cfg: GeomCfg | CollisionCfg) -> None:
@@ -198,7 +206,8 @@ def _edited_attributes(
     for cfg in cfgs:
         names = tuple(geom.name for geom in _matched_geoms(spec, cfg.geom_names_expr))
         for field in (*_REQUIRED, *_PATCHES):
-            values = resolve_field(getattr(cfg, field), names)
+            always = isinstance(cfg, CollisionCfg) and field in _REQUIRED
+            values = names if always else resolve_field(getattr(cfg, field), names)
             edited |= {
                 (name, field)
                 for name, value in zip(names, values, strict=True)

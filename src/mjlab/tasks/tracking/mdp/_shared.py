@@ -8,10 +8,22 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.tasks.tracking.mdp.motion_command import MotionCommand
+from mjlab.tasks.tracking.mdp.motion_reader import MotionReader
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
-    from mjlab.tasks.tracking.mdp.motion_reader import MotionReader
+
+# What terms read of a command, whose class may be a package's own.
+_READ = (
+    "anchor_pos_w",
+    "anchor_quat_w",
+    "robot_anchor_pos_w",
+    "robot_anchor_quat_w",
+    "body_pos_relative_w",
+    "body_quat_relative_w",
+    "robot_body_pos_w",
+    "robot_body_quat_w",
+)
 
 
 def motion_command(env: ManagerBasedRlEnv, command_name: str) -> MotionCommand:
@@ -34,22 +46,29 @@ def check_motion_term(
     Raises:
         ValueError: there is no such command, a body is none of those it tracks, none is left, or
             `std` or `threshold` is not positive.
-        TypeError: the command is of another kind.
+        TypeError: the command lacks what a `MotionCommand` has.
     """
     names = env.command_manager.active_terms
     if command_name not in names:
         raise ValueError(f"There is no command {command_name!r}. There are: {list(names)}.")
     manager: Any = env.command_manager
     command = manager.get_term(command_name)
-    if not isinstance(command, MotionCommand):
+    missing = [] if isinstance(command, MotionCommand) else _missing(command)
+    if missing:
         raise TypeError(
-            f"The command {command_name!r} is a {type(command).__name__}, and a MotionCommand is "
-            "needed."
+            f"Command {command_name!r}: expected a MotionCommand or a term with its attributes, got "
+            f"a {type(command).__name__} without {', '.join(missing)}."
         )
     body_columns(command, body_names)
     for label, value in (("std", std), ("threshold", threshold)):
         if value is not None and not value > 0.0:
             raise ValueError(f"{label} is {value!r}; it has to be positive.")
+
+
+def _missing(command: Any) -> list[str]:
+    # Listed rather than read: before the first reset, a property may have nothing to return.
+    missing = sorted(set(_READ) - set(dir(command)))
+    return missing if hasattr(command.cfg, "body_names") else [*missing, "cfg.body_names"]
 
 
 def body_columns(command: MotionReader, body_names: tuple[str, ...] | None) -> slice | torch.Tensor:
@@ -60,9 +79,9 @@ def body_columns(command: MotionReader, body_names: tuple[str, ...] | None) -> s
     """
     if body_names is None:
         return slice(None)
-    return _columns_of(
-        tuple(body_names), tuple(command.body_names), str(command.body_indexes.device)
-    )
+    tracked = command.body_names if isinstance(command, MotionReader) else command.cfg.body_names
+    device = str(command.body_pos_relative_w.device)
+    return _columns_of(tuple(body_names), tuple(tracked), device)
 
 
 @functools.lru_cache(maxsize=256)

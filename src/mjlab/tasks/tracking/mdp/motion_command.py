@@ -335,7 +335,7 @@ class MotionCommand(MotionReader, CommandTerm):
         for name, value in tracking_metrics(self).items():
             self.metrics[name].copy_(value)
 
-    def _update_command(self, env_ids: torch.Tensor | None) -> None:
+    def _update_command(self, env_ids: torch.Tensor | None = None) -> None:
         self.time_steps[slice(None) if env_ids is None else env_ids] += 1
         is_over = self.time_steps >= self.motion.lengths[self.motion_ids]
         over = is_over.nonzero().flatten()

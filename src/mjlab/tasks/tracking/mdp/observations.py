@@ -38,9 +38,9 @@ def motion_anchor_ori_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tens
 def robot_body_pos_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     """Positions of the robot's tracked bodies in the frame of its anchor, (N, 3 K), in m."""
     command = motion_command(env, command_name)
-    pos, anchor = command.robot_body_pos_w, command.anchor_index
+    pos = command.robot_body_pos_w
     quat = command.robot_anchor_quat_w[:, None].expand(-1, pos.shape[1], -1)
-    return quat_apply_inverse(quat, pos - pos[:, anchor : anchor + 1]).flatten(1)
+    return quat_apply_inverse(quat, pos - command.robot_anchor_pos_w[:, None]).flatten(1)
 
 
 @checked_when_built(check_motion_term)
@@ -50,8 +50,9 @@ def robot_body_ori_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     For each body, the first two columns of the rotation matrix, row by row.
     """
     command = motion_command(env, command_name)
-    quat, anchor = command.robot_body_quat_w, command.anchor_index
-    relative = quat_mul(quat_inv(quat[:, anchor : anchor + 1]).expand_as(quat), quat)
+    quat = command.robot_body_quat_w
+    anchor = command.robot_anchor_quat_w[:, None]
+    relative = quat_mul(quat_inv(anchor).expand_as(quat), quat)
     return _two_columns(relative).flatten(1)
 
 

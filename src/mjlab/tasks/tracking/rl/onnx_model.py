@@ -9,7 +9,7 @@ import torch
 if TYPE_CHECKING:
     from mjlab.tasks.tracking.mdp.motion_loader import MotionLibrary
 
-_REFERENCE = (
+REFERENCE = (
     "joint_pos",
     "joint_vel",
     "body_pos_w",
@@ -17,6 +17,7 @@ _REFERENCE = (
     "body_lin_vel_w",
     "body_ang_vel_w",
 )
+"""Tensors of a motion that the exported policy returns, with a row for each frame."""
 
 
 class PolicyWithReference(torch.nn.Module):
@@ -47,7 +48,7 @@ class PolicyWithReference(torch.nn.Module):
                 f"A policy with the inputs {list(policy.input_names)} cannot be exported with the "
                 "reference; one that reads observations only can."
             )
-        for name in _REFERENCE:
+        for name in REFERENCE:
             self.register_buffer(name, getattr(motion, name).detach().cpu().clone())
         self.last_frame = motion.time_step_total - 1
 
@@ -59,7 +60,7 @@ class PolicyWithReference(torch.nn.Module):
     @property
     def output_names(self) -> list[str]:
         """Names of the outputs."""
-        return ["actions", *_REFERENCE]
+        return ["actions", *REFERENCE]
 
     def get_dummy_inputs(self) -> tuple[torch.Tensor, ...]:
         """Return inputs of the right shapes."""
@@ -68,4 +69,4 @@ class PolicyWithReference(torch.nn.Module):
     def forward(self, obs: torch.Tensor, time_step: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Return the outputs."""
         frame = time_step.long().squeeze(-1).clamp(0, self.last_frame)
-        return (self.policy(obs), *(getattr(self, name)[frame] for name in _REFERENCE))
+        return (self.policy(obs), *(getattr(self, name)[frame] for name in REFERENCE))

@@ -11,8 +11,9 @@ from mjlab.rl.exporting_runner import ExportingOnPolicyRunner
 from mjlab.rl.onnx_export import export_to_onnx
 from mjlab.rl.rsl import VecEnv
 from mjlab.tasks.tracking.mdp.motion_command import MotionCommand
+from mjlab.tasks.tracking.mdp.motion_sampling import HardSegmentSampler
 from mjlab.tasks.tracking.motion_record import record_motions
-from mjlab.tasks.tracking.rl.onnx_model import PolicyWithReference
+from mjlab.tasks.tracking.rl.onnx_model import REFERENCE, PolicyWithReference
 from mjlab.tasks.tracking.rl.reference_actor import ReferenceActor
 from mjlab.tasks.tracking.wandb_motions import full_artifact_name
 
@@ -24,6 +25,9 @@ _FAILURES = "motion_failures"
 class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
     """Trains as `MjlabOnPolicyRunner` does, exports the policy with the reference whenever it saves,
     and keeps the motions in the run's folder.
+
+    The command is a `MotionCommand`, or any term named `motion`. Of a class that is not ours, the
+    motions are those of `motion` and `cfg.motion_file`; without them the policy is exported alone.
 
     Checkpoints hold the statistics of failures, so that a run that resumes, with however many
     environments, still knows where the robot fails.
@@ -52,7 +56,7 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
                 follow.
         """
         super().__init__(env, train_cfg, log_dir, device)
-        self.motion_command: MotionCommand = _motion_command(self.env.unwrapped)
+        self.motion_command: Any = _motion_command(self.env.unwrapped)
         actor = self.alg.get_policy()
         if isinstance(actor, ReferenceActor):
             actor.follow(self.env.unwrapped, self.motion_command)
@@ -72,7 +76,7 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
         Raises:
             CheckpointError: the checkpoint could not be written.
         """
-        sampler = self.motion_command.sampler
+        sampler = self._sampler
         if sampler is not None:
             infos = {**(infos or {}), _FAILURES: sampler.failed.cpu().clone()}
         super().save(path, infos)
@@ -96,7 +100,7 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
         Arguments, result and errors are those of `MjlabOnPolicyRunner.load`.
         """
         infos = super().load(path, load_cfg, strict, map_location)
-        sampler, failed = self.motion_command.sampler, infos.get(_FAILURES)
+        sampler, failed = self._sampler, infos.get(_FAILURES)
         if load_cfg is None and sampler is not None and failed is not None:
             if failed.shape == sampler.failed.shape:
                 sampler.failed.copy_(failed)
@@ -111,25 +115,38 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
         self, path: str, filename: str = "policy.onnx", verbose: bool = False
     ) -> None:
         """Write the policy and the reference to `path`/`filename`: see `PolicyWithReference`."""
+        motion: Any = getattr(self.motion_command, "motion", None)
+        missing = [name for name in (*REFERENCE, "time_step_total") if not hasattr(motion, name)]
+        if missing:
+            logger.info("The policy is exported without the motion, which has no %s.", missing)
+            super().export_policy_to_onnx(path, filename, verbose)
+            return
         policy = self.alg.get_policy().as_onnx(verbose=verbose)
-        model = PolicyWithReference(policy, self.motion_command.motion)
-        export_to_onnx(model, Path(path) / filename, verbose)
+        export_to_onnx(PolicyWithReference(policy, motion), Path(path) / filename, verbose)
 
     def onnx_metadata(self) -> dict[str, Any]:
         """Return the metadata of the base with what the reference is of."""
-        command = self.motion_command
-        metadata = super().onnx_metadata()
-        metadata |= {
-            "anchor_body_name": command.cfg.anchor_body_name,
-            "body_names": list(command.body_names),
-            "motion_names": list(command.motion.names),
-            "motion_starts": command.motion.starts.tolist(),
-            "motion_lengths": command.motion.lengths.tolist(),
-        }
+        command, metadata = self.motion_command, super().onnx_metadata()
+        if hasattr(command.cfg, "anchor_body_name"):
+            metadata["anchor_body_name"] = command.cfg.anchor_body_name
+        if hasattr(command.cfg, "body_names"):
+            metadata["body_names"] = list(command.cfg.body_names)
+        if isinstance(command, MotionCommand):
+            metadata |= {
+                "motion_names": list(command.motion.names),
+                "motion_starts": command.motion.starts.tolist(),
+                "motion_lengths": command.motion.lengths.tolist(),
+            }
         return metadata
 
+    @property
+    def _sampler(self) -> HardSegmentSampler | None:
+        sampler = getattr(self.motion_command, "sampler", None)
+        return sampler if isinstance(sampler, HardSegmentSampler) else None
+
     def _keep_motions(self, folder: Path) -> None:
-        new = record_motions(self.motion_command.motion_files, folder, self._registry_name)
+        files = self._motion_files
+        new = record_motions(files, folder, self._registry_name) if files else []
         # Whoever has a live run at Weights & Biases has imported wandb.
         wandb: Any = sys.modules.get("wandb")
         if self.cfg.get("logger") != "wandb" or getattr(wandb, "run", None) is None:
@@ -141,14 +158,22 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
             self._is_marked = True
             wandb.run.use_artifact(full_artifact_name(self._registry_name))
 
+    @property
+    def _motion_files(self) -> tuple[Path, ...]:
+        command = self.motion_command
+        if isinstance(command, MotionCommand):
+            return command.motion_files
+        path = getattr(command.cfg, "motion_file", "")
+        return (Path(path),) if path and Path(path).is_file() else ()
 
-def _motion_command(env: Any) -> MotionCommand:
+
+def _motion_command(env: Any) -> Any:
     manager = env.command_manager
-    terms = [manager.get_term(name) for name in manager.active_terms]
-    found = [term for term in terms if isinstance(term, MotionCommand)]
-    if not found:
+    terms = {name: manager.get_term(name) for name in manager.active_terms}
+    found = [term for term in terms.values() if isinstance(term, MotionCommand)]
+    if not found and "motion" not in terms:
         raise ValueError(
-            f"MotionTrackingOnPolicyRunner needs a MotionCommand; the commands are "
-            f"{list(manager.active_terms)}."
+            "MotionTrackingOnPolicyRunner needs a MotionCommand, or a command named 'motion'; the "
+            f"commands are {list(terms)}."
         )
-    return found[0]
+    return found[0] if found else terms["motion"]

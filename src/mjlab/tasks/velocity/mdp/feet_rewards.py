@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.compat import accepts_older_params
 from mjlab.envs.mdp._checks import require_command
 from mjlab.envs.mdp._indexing import columns
 from mjlab.managers.build_checks import checked_when_built
@@ -87,6 +88,7 @@ def _check_clearance(
     check_same_feet(env, heights, ("the selection of sites", site_columns(env, asset_cfg)))
 
 
+@accepts_older_params
 @checked_when_built(_check_clearance)
 def feet_clearance(
     env: ManagerBasedRlEnv,
@@ -110,12 +112,23 @@ def feet_clearance(
         command_threshold: Commanded motion above which there is a cost.
         asset_cfg: Entity, and the sites of the feet in the order of the sensor's frames.
     """
-    height = env.scene[height_sensor_name].data.heights
-    speed = _site_speed(env, asset_cfg)
-    cost = ((height - target_height).abs() * speed).sum(dim=1)
+    miss = env.scene[height_sensor_name].data.heights - target_height
+    return clearance_cost(env, miss, command_name, command_threshold, asset_cfg)
+
+
+def clearance_cost(
+    env: ManagerBasedRlEnv,
+    miss: torch.Tensor,
+    command_name: str | None,
+    command_threshold: float,
+    asset_cfg: SceneEntityCfg,
+) -> torch.Tensor:
+    """Return the cost of feet that miss their height by `miss` (m), (N, feet), while they move."""
+    cost = (miss.abs() * _site_speed(env, asset_cfg)).sum(dim=1)
     return if_commanded(cost, env, command_name, command_threshold)
 
 
+@accepts_older_params
 class feet_swing_height:
     """Cost of landing after a swing that was too low or too high: `(peak / target - 1)^2`.
 
@@ -134,7 +147,7 @@ class feet_swing_height:
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
         params = cfg.params
-        contact, height = params["sensor_name"], params["height_sensor_name"]
+        contact = params["sensor_name"]
         require_command(env, params["command_name"])
         check_air_time_sensor(env, contact)
         check_feet_sensor(env, contact)
@@ -145,9 +158,7 @@ class feet_swing_height:
             )
         feet = contact_columns(env, contact)
         check_same_feet(
-            env,
-            (f"The contact sensor {contact!r}", feet),
-            (f"the height sensor {height!r}", height_columns(env, height)),
+            env, (f"The contact sensor {contact!r}", feet), self._height_columns(env, params)
         )
         self.peak_heights = torch.zeros(env.num_envs, len(feet), device=env.device)
 
@@ -161,17 +172,32 @@ class feet_swing_height:
         command_threshold: float,
     ) -> torch.Tensor:
         """Take up the heights of this step, and return the cost of its landings."""
+        heights = env.scene[height_sensor_name].data.heights
+        cost = self.landing_cost(env, sensor_name, heights, target_height)
+        return if_commanded(cost, env, command_name, command_threshold)
+
+    def landing_cost(
+        self, env: ManagerBasedRlEnv, sensor_name: str, heights: torch.Tensor, target_height: float
+    ) -> torch.Tensor:
+        """Take up heights (m), (N, feet), and return the cost of landings, (N,)."""
         sensor = env.scene[sensor_name]
         peaks = self.peak_heights
         is_swinging = sensor.data.found == 0
-        higher = torch.maximum(peaks, env.scene[height_sensor_name].data.heights)
+        higher = torch.maximum(peaks, heights)
         torch.where(is_swinging, higher, peaks, out=peaks)
         has_landed = sensor.compute_first_contact(dt=env.step_dt)
         log_metric(env, "peak_height_mean", masked_mean(peaks, has_landed))
         miss = (peaks / target_height - 1.0).square_()
         cost = torch.where(has_landed, miss, 0.0).sum(dim=1)
         peaks.masked_fill_(has_landed, 0.0)
-        return if_commanded(cost, env, command_name, command_threshold)
+        return cost
+
+    @staticmethod
+    def _height_columns(
+        env: ManagerBasedRlEnv, params: dict[str, Any]
+    ) -> tuple[str, list[tuple[str, int]]]:
+        name = params["height_sensor_name"]
+        return f"the height sensor {name!r}", height_columns(env, name)
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
         """Forget the swings that a reset cut off, so that the next episode does not pay for them."""

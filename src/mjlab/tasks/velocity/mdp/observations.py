@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from mjlab.compat import older_names
+from mjlab.compat import accepts_older_params, older_names
 from mjlab.managers.build_checks import checked_when_built
 from mjlab.tasks.velocity.mdp.sensor_checks import (
     check_air_time_sensor,
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
 
+@accepts_older_params
 @checked_when_built(check_height_sensor)
 def foot_height(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
     """Height of each foot above the ground (m), (N, feet), from a height sensor."""

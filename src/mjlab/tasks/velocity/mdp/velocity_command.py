@@ -232,7 +232,7 @@ class UniformVelocityCommand(CommandTerm):
         # Taken after the forward rule, which holds for world commands too.
         self.vel_command_w[env_ids] = command
 
-    def _update_command(self, env_ids: torch.Tensor | None) -> None:
+    def _update_command(self, env_ids: torch.Tensor | None = None) -> None:
         index = slice(None) if env_ids is None else env_ids
         self._update_rows(index, self.robot.data.root_link_quat_w[index])
 

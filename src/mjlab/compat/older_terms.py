@@ -1,0 +1,170 @@
+"""Terms as earlier 1.x releases spelled them; reached by name, through the tables of `mjlab.compat`.
+
+Commands of 1.1 to 1.5 updated all environments in every call, with `_update_command(self)` and
+`compute(self, dt)`. After a partial reset only some environments may advance, so the state of the
+others is put back.
+
+Foot terms of 1.1 and 1.2 read the heights of sites above z = 0 instead of a height sensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from mjlab.envs.mdp._checks import require_command
+from mjlab.envs.mdp._indexing import columns
+from mjlab.managers.build_checks import checked_when_built
+from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.tasks.velocity.mdp import feet_rewards
+from mjlab.tasks.velocity.mdp._shared import if_commanded
+from mjlab.tasks.velocity.mdp.sensor_checks import site_columns
+from mjlab.utils.state import capture_state, restore_state
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+
+_ROBOT = SceneEntityCfg("robot")
+_PHYSICS = ("qpos", "qvel", "mocap_pos", "mocap_quat")
+
+
+def update_command(method: Callable[..., Any], term: Any, *args: Any, **kwargs: Any) -> Any:
+    """Call `_update_command(self)`; with `env_ids`, only their state changes."""
+    env_ids, args, kwargs = _split_env_ids(args, kwargs)
+    with _other_envs_kept(term, env_ids):
+        return method(term, *args, **kwargs)
+
+
+def compute(method: Callable[..., Any], term: Any, dt: Any, *args: Any, **kwargs: Any) -> Any:
+    """Call `compute(self, dt)` with `dt` as one number; with `env_ids`, only their state changes.
+
+    A `dt` per environment is zero where an episode has just begun. Those environments get the time
+    back that the call takes from their `time_left`.
+    """
+    env_ids, args, kwargs = _split_env_ids(args, kwargs)
+    if isinstance(dt, torch.Tensor) and dt.numel() > 1:
+        step_dt = term._env.step_dt
+        term.time_left += step_dt - dt
+        dt = step_dt
+    with _other_envs_kept(term, env_ids):
+        return method(term, dt, *args, **kwargs)
+
+
+def create_gui(
+    method: Callable[..., Any], term: Any, name: str, server: Any, get_env_idx: Any, *_: Any
+) -> Any:
+    """Call `create_gui(self, name, server, get_env_idx)` of release 1.2."""
+    return method(term, name, server, get_env_idx)
+
+
+def _split_env_ids(
+    args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> tuple[Any, tuple[Any, ...], dict[str, Any]]:
+    """Separate `env_ids` from arguments that a method in the field has of its own."""
+    if "env_ids" in kwargs:
+        kwargs = dict(kwargs)
+        return kwargs.pop("env_ids"), args, kwargs
+    if args and (args[0] is None or isinstance(args[0], (torch.Tensor, slice))):
+        return args[0], args[1:], kwargs
+    return None, args, kwargs
+
+
+@contextmanager
+def _other_envs_kept(term: Any, env_ids: Any) -> Generator[None]:
+    """Put back what the body changes in a term or in the physics outside `env_ids` (None: all).
+
+    Tensors with one row per environment keep their new values in rows `env_ids`. All other state,
+    such as step counters and running means, is put back whole: a reset takes no time.
+    """
+    if env_ids is None or len(env_ids) == term.num_envs:
+        yield
+        return
+    data = term._env.sim.data
+    before = capture_state(term)
+    physics = {name: getattr(data, name).clone() for name in _PHYSICS}
+    yield
+    restore_state(term, _merge_rows(before, capture_state(term), env_ids, term.num_envs))
+    moved = False
+    for name, old in physics.items():
+        field = getattr(data, name)
+        kept = _merge_rows(old, field, env_ids, term.num_envs)
+        moved |= not torch.equal(kept, field)
+        field.copy_(kept)
+    if moved:
+        # The body may have computed derived quantities from the state that was put back.
+        term._env.sim.forward()
+
+
+def _merge_rows(before: Any, after: Any, env_ids: torch.Tensor, num_envs: int) -> Any:
+    """Return `before`, with the rows `env_ids` of its per-environment tensors from `after`."""
+    if isinstance(before, torch.Tensor) and isinstance(after, torch.Tensor):
+        if before.shape != after.shape or before.shape[:1] != (num_envs,):
+            return before
+        merged = before.clone()
+        merged[env_ids] = after[env_ids]
+        return merged
+    if isinstance(before, dict) and isinstance(after, dict):
+        return {
+            key: _merge_rows(value, after.get(key), env_ids, num_envs)
+            for key, value in before.items()
+        }
+    if isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
+        pairs = zip(before, after, strict=True)
+        return [_merge_rows(old, new, env_ids, num_envs) for old, new in pairs]
+    return before
+
+
+def _check_sites(
+    env: ManagerBasedRlEnv,
+    command_name: str | None = None,
+    asset_cfg: SceneEntityCfg = _ROBOT,
+    **_: Any,
+) -> None:
+    require_command(env, command_name)
+    site_columns(env, asset_cfg)
+
+
+@checked_when_built(_check_sites)
+def foot_height(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:
+    """Height of each selected site above z = 0 (m), (N, sites)."""
+    sites = columns(asset_cfg.site_ids, env.device)
+    return env.scene[asset_cfg.name].data.site_pos_w[:, sites, 2]
+
+
+@checked_when_built(_check_sites)
+def feet_clearance(
+    env: ManagerBasedRlEnv,
+    target_height: float,
+    command_name: str | None = None,
+    command_threshold: float = 0.01,
+    asset_cfg: SceneEntityCfg = _ROBOT,
+) -> torch.Tensor:
+    """Distance of moving sites from `target_height` above z = 0 (m^2/s), (N,)."""
+    miss = foot_height(env, asset_cfg) - target_height
+    return feet_rewards.clearance_cost(env, miss, command_name, command_threshold, asset_cfg)
+
+
+class feet_swing_height(feet_rewards.feet_swing_height):
+    """Cost of landing after a swing whose peak above z = 0 was too low or too high."""
+
+    def __call__(  # ty: ignore[incompatible-method-override]
+        self,
+        env: ManagerBasedRlEnv,
+        sensor_name: str,
+        target_height: float,
+        command_name: str,
+        command_threshold: float,
+        asset_cfg: SceneEntityCfg,
+    ) -> torch.Tensor:
+        """Take up the heights of this step, and return the cost of its landings."""
+        cost = self.landing_cost(env, sensor_name, foot_height(env, asset_cfg), target_height)
+        return if_commanded(cost, env, command_name, command_threshold)
+
+    @staticmethod
+    def _height_columns(
+        env: ManagerBasedRlEnv, params: dict[str, Any]
+    ) -> tuple[str, list[tuple[str, int]]]:
+        return "the selection of sites", site_columns(env, params["asset_cfg"])

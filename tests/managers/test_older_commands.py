@@ -1,0 +1,236 @@
+"""Commands in the spelling of releases 1.1 to 1.5: whole-batch updates in an environment of today."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from mjlab import compat
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.managers import CommandTerm, CommandTermCfg
+from mjlab.tasks.registry import load_env_cfg
+from mjlab.tasks.velocity.mdp import UniformVelocityCommand
+
+NUM_ENVS = 3
+
+
+@dataclass(kw_only=True)
+class PlayCfg(CommandTermCfg):
+    term: type = CommandTerm
+
+    def build(self, env):
+        return self.term(self, env)
+
+
+class Play(CommandTerm):
+    """A motion player as packages write them: a frame a step, and the robot put back at the end."""
+
+    last = 4
+
+    def __init__(self, cfg, env):
+        super().__init__(cfg, env)
+        self.frame = torch.zeros(self.num_envs, 1)
+        self.step_count = 0
+        self.metrics["updates"] = torch.zeros(self.num_envs)
+        self.dts = []
+
+    @property
+    def command(self):
+        return self.frame
+
+    def _resample_command(self, env_ids):
+        self.frame[env_ids] = 0.0
+        self._env.sim.data.qpos[env_ids] = 0.0
+
+    def _update_metrics(self):
+        self.metrics["updates"] += 1.0
+
+
+class Update(Play):
+    def _update_command(self):
+        self.step_count += 1
+        self.frame += 1.0
+        ended = (self.frame[:, 0] > self.last).nonzero().flatten()
+        if len(ended) > 0:
+            self._resample_command(ended)
+            self._env.sim.forward()
+
+
+class Keywords(Update):
+    """Has keyword arguments of its own."""
+
+    def _update_command(self, again=False, *, faster=0.0):
+        super()._update_command()
+        self.frame += faster
+        if again:
+            self._update_command(faster=1.0)
+
+
+class Compute(Play):
+    """Redraws and advances by itself."""
+
+    def compute(self, dt):
+        assert isinstance(dt, float)
+        self.dts.append(dt)
+        super().compute(dt)
+
+    def _update_command(self, env_ids=None):
+        self.frame[slice(None) if env_ids is None else env_ids] += 1.0
+
+
+class Both(Compute):
+    def _update_command(self):
+        super()._update_command()
+
+
+class Mixed(SimpleNamespace):
+    def _update_command(self):
+        self.frame += 1.0
+
+
+class FromMixin(Mixed, Play):
+    def __init__(self, cfg, env):
+        Play.__init__(self, cfg, env)
+
+
+@pytest.fixture(autouse=True)
+def _forget_warnings():
+    compat._warn_once.cache_clear()
+
+
+def make(term, **fields):
+    cfg = load_env_cfg("Mjlab-Cartpole-Balance")
+    cfg.scene.num_envs = NUM_ENVS
+    fields = {"resampling_time_range": (10.0, 10.0), **fields}
+    cfg.commands = {"play": PlayCfg(term=term, **fields)}
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    return env, env.command_manager.get_term("play")
+
+
+def step(env):
+    return env.step(torch.zeros(NUM_ENVS, 1))
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+@pytest.mark.parametrize("term", [Update, Keywords, Compute, Both, FromMixin])
+def test_every_environment_advances_once_a_step_and_once_a_reset(term):
+    env, play = make(term)
+    env.reset()
+    assert play.frame.flatten().tolist() == [1.0] * NUM_ENVS
+    step(env)
+    assert play.frame.flatten().tolist() == [2.0] * NUM_ENVS
+    assert play.metrics["updates"].tolist() == [2.0] * NUM_ENVS
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+@pytest.mark.parametrize("term", [Update, Keywords, Compute, Both, FromMixin])
+def test_a_partial_reset_leaves_commands_metrics_and_robots_of_the_others(term):
+    env, play = make(term)
+    env.reset()
+    # The next update would end these motions, and put the robots back.
+    play.frame[:] = play.last
+    env.sim.data.qpos[:] = torch.arange(1.0, NUM_ENVS + 1.0)[:, None] / 10.0
+    env.sim.forward()
+    before = {
+        "metrics": play.metrics["updates"].clone(),
+        "time_left": play.time_left.clone(),
+        "qpos": env.sim.data.qpos.clone(),
+        "xpos": env.sim.data.xpos.clone(),
+    }
+    counts = play.step_count
+    env.reset(env_ids=torch.tensor([1]))
+    others = [0, 2]
+    assert play.frame[others].flatten().tolist() == [play.last] * 2
+    assert play.frame[1].item() == 1.0
+    assert play.step_count == counts
+    now = {
+        "metrics": play.metrics["updates"],
+        "time_left": play.time_left,
+        "qpos": env.sim.data.qpos,
+        "xpos": env.sim.data.xpos,
+    }
+    for name, values in now.items():
+        torch.testing.assert_close(values[others], before[name][others], rtol=0, atol=1e-6)
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+def test_an_older_compute_gets_a_number_and_new_commands_their_full_time():
+    env, play = make(Compute)
+    env.reset()
+    env.episode_length_buf[1] = env.max_episode_length
+    step(env)
+    assert play.dts == [0.0, env.step_dt]
+    assert play.time_left.tolist() == pytest.approx([10.0 - env.step_dt, 10.0, 10.0 - env.step_dt])
+    env.close()
+
+
+def test_each_older_method_warns_once_when_it_is_first_called_and_not_before():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+
+        class Quiet(Update):
+            def _update_command(self):
+                pass
+
+        env, _ = make(Quiet)
+    with pytest.warns(FutureWarning, match=r"Quiet\._update_command takes no env_ids") as seen:
+        env.reset()
+        step(env)
+    assert len([w for w in seen if "takes no" in str(w.message)]) == 1
+    env.close()
+
+
+def test_methods_in_todays_spelling_are_left_alone():
+    class Today(Play):
+        def _update_command(self, ids):
+            pass
+
+        def compute(self, *args, **kwargs):
+            pass
+
+    assert Today._update_command.__code__.co_varnames[:2] == ("self", "ids")
+    assert Today.compute.__code__.co_varnames[:3] == ("self", "args", "kwargs")
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+def test_a_subclass_of_the_velocity_command_may_call_its_update_without_env_ids():
+    class Doubled(UniformVelocityCommand):
+        def _update_command(self):
+            super()._update_command()
+            self.vel_command_b *= 2.0
+
+    cfg = load_env_cfg("Mjlab-Velocity-Flat-Unitree-Go1")
+    cfg.scene.num_envs = 2
+    twist = cfg.commands["twist"]
+    ranges = replace(twist.ranges, lin_vel_x=(0.5, 0.5), lin_vel_y=(0.0, 0.0))
+
+    class TwistCfg(type(twist)):
+        def build(self, env):
+            return Doubled(self, env)
+
+    fields = vars(twist) | {"ranges": ranges, "rel_standing_envs": 0.0}
+    cfg.commands, cfg.curriculum = {"twist": TwistCfg(**fields)}, {}
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    env.reset()
+    assert env.command_manager.get_command("twist")[:, 0].tolist() == [1.0, 1.0]
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+def test_controls_of_release_1_2_get_the_three_arguments_they_take():
+    calls = []
+
+    class Controls(Play):
+        def create_gui(self, name, server, get_env_idx):
+            calls.append((name, server, get_env_idx))
+
+    env, _ = make(Controls)
+    env.command_manager.create_gui("server", print, on_change=print)
+    assert calls == [("play", "server", print)]
+    env.close()

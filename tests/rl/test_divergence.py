@@ -1,0 +1,111 @@
+"""Robots whose physics diverges: training ends with the joint, its speed and a cure."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import mujoco
+import pytest
+import torch
+
+from mjlab.actuator import BuiltinPositionActuatorCfg
+from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
+from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg, mdp
+from mjlab.managers import (
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    RewardTermCfg,
+    TerminationTermCfg,
+)
+from mjlab.rl import MjlabOnPolicyRunner, RslRlOnPolicyRunnerCfg, RslRlVecEnvWrapper
+from mjlab.rl.divergence import DivergedError
+from mjlab.scene import SceneCfg
+from mjlab.sim import MujocoCfg, SimulationCfg
+
+# A finger of a few grams at the end of an arm.
+ARM = """<mujoco><worldbody><body name="arm" pos="0 0 1"><joint name="shoulder" axis="0 1 0"/>
+  <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0" mass=".3"/>
+  <body pos=".3 0 0"><joint name="elbow" axis="0 1 0"/>
+  <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0" mass=".2"/>
+  <body pos=".3 0 0"><joint name="finger" axis="0 1 0"/>
+  <geom type="capsule" size=".005" fromto="0 0 0 .05 0 0" mass=".005"/></body></body></body>
+  </worldbody></mujoco>"""
+
+
+@pytest.fixture
+def make_runner(tmp_path, monkeypatch):
+    # MuJoCo writes its warnings to a file where it runs.
+    monkeypatch.chdir(tmp_path)
+    built = []
+
+    def make(timestep=0.02, normalized=False, **fields):
+        servo = BuiltinPositionActuatorCfg(
+            target_names_expr=(".*",), stiffness=60.0, damping=3.0, effort_limit=8.0, **fields
+        )
+        articulation = EntityArticulationInfoCfg(actuators=(servo,))
+        robot = EntityCfg(spec_fn=lambda: mujoco.MjSpec.from_string(ARM), articulation=articulation)
+        terms = {
+            "pos": ObservationTermCfg(func=mdp.joint_pos_rel),
+            "vel": ObservationTermCfg(func=mdp.joint_vel_rel),
+        }
+        action = mdp.JointPositionActionCfg(entity_name="robot", actuator_names=(".*",), scale=0.5)
+        cfg = ManagerBasedRlEnvCfg(
+            decimation=2,
+            episode_length_s=4.0,
+            seed=1,
+            scene=SceneCfg(num_envs=8, entities={"robot": robot}),
+            sim=SimulationCfg(engine="native", mujoco=MujocoCfg(timestep=timestep)),
+            observations={name: ObservationGroupCfg(terms=terms) for name in ("actor", "critic")},
+            actions={"joints": action},
+            rewards={"slow": RewardTermCfg(func=mdp.joint_vel_l2, weight=-1e-3)},
+            terminations={"end": TerminationTermCfg(func=mdp.time_out, time_out=True)},
+        )
+        env = ManagerBasedRlEnv(cfg, device="cpu")
+        built.append(env)
+        train = asdict(RslRlOnPolicyRunnerCfg(num_steps_per_env=16, max_iterations=30))
+        train["obs_groups"] = {"actor": ("actor",), "critic": ("critic",)}
+        for network in ("actor", "critic"):
+            train[network]["hidden_dims"] = (8,)
+            train[network]["obs_normalization"] = normalized
+        return MjlabOnPolicyRunner(RslRlVecEnvWrapper(env), train, None, "cpu")
+
+    yield make
+    for env in built:
+        env.close()
+
+
+@pytest.mark.parametrize("normalized", [False, True])
+def test_training_names_the_joint_its_speed_and_the_cure(make_runner, normalized):
+    with pytest.raises(DivergedError, match=r"joint 'robot/finger' reached .* rad/s") as caught:
+        make_runner(normalized=normalized).learn(30)
+    for cure in ("timestep of 0.02 s", "armature (now 0)", "viscous_damping", "effort_limit"):
+        assert cure in str(caught.value)
+    assert caught.value.__cause__ is not None
+
+
+@pytest.mark.parametrize("cure", [{"armature": 0.01}, {"viscous_damping": 0.5}])
+def test_what_the_message_advises_cures_it(make_runner, cure):
+    runner = make_runner(**cure)
+    runner.learn(2)
+    assert runner.current_learning_iteration == 2
+
+
+def test_a_policy_that_breaks_on_its_own_keeps_its_error(make_runner):
+    runner = make_runner(armature=0.01)
+    with torch.no_grad():
+        for parameter in runner.alg.get_policy().parameters():
+            parameter.fill_(float("nan"))
+    with pytest.raises((RuntimeError, ValueError)) as caught:
+        runner.learn(1)
+    assert not isinstance(caught.value, DivergedError)
+
+
+def test_an_error_that_is_not_about_numbers_passes(make_runner, monkeypatch):
+    runner = make_runner()
+
+    def fail(*args, **kwargs):
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(runner.alg, "update", fail)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        runner.learn(1)
