@@ -2,7 +2,7 @@
 UV := ./tools/uv
 DEV := $(UV) run --group dev
 
-.PHONY: help train test test-slow check format bench docs
+.PHONY: help train test test-slow check format bench gpu docs
 
 help:  ## Show this list.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -28,6 +28,13 @@ format:  ## Format the code and fix what lint can fix.
 
 bench:  ## Measure; writes the table to benchmarks/results/.
 	$(DEV) python benchmarks/run.py
+
+# No network and no uv: any Python with the dependencies, that of the project where there is one.
+PYTHON ?= $(or $(wildcard .venv/bin/python),python3)
+DEVICE ?= cuda:0
+
+gpu:  ## Test and measure on an NVIDIA GPU, in ten minutes; PARTS="parity speed" for some parts.
+	$(PYTHON) benchmarks/gpu.py --device $(DEVICE) $(if $(PARTS),--part $(PARTS)) $(GPU_FLAGS)
 
 docs:  ## Build the documentation into docs/_build/html.
 	$(UV) run --group docs sphinx-build -W --keep-going -b html docs docs/_build/html

@@ -21,10 +21,12 @@ def alternate(
     repeats: int = 15,
     warm_up: int = 5,
     before: Sample = lambda: None,
+    wait: Sample = lambda: None,
 ) -> list[float]:
     """Return the median time of each sample, in seconds, taking turns so that noise hits all.
 
-    `before` is called before each round of samples, and not timed.
+    `before` is called before each round of samples, and not timed. `wait` returns when a device has
+    done what samples have queued on it.
     """
     for sample in samples:
         for _ in range(warm_up):
@@ -36,9 +38,11 @@ def alternate(
         # In the other order next time: whoever comes second finds other things in the caches.
         turns.reverse()
         for sample, taken in turns:
+            wait()
             begin = time.perf_counter()
             for _ in range(steps):
                 sample()
+            wait()
             taken.append((time.perf_counter() - begin) / steps)
     return [statistics.median(taken) for taken in times]
 

@@ -16,6 +16,26 @@ from hypothesis import settings
 settings.register_profile("mjlab", deadline=None, derandomize=True)
 settings.load_profile("mjlab")
 
+# Device of tests marked `cuda`. `cpu` lets them run without a GPU, which shows that they work.
+CUDA_DEVICE = os.environ.get("MJLAB_TEST_CUDA_DEVICE", "cuda:0")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip tests marked `cuda` where their device is missing."""
+    import torch
+
+    if CUDA_DEVICE == "cpu" or torch.cuda.is_available():
+        return
+    for item in items:
+        if item.get_closest_marker("cuda"):
+            item.add_marker(pytest.mark.skip(reason="no NVIDIA GPU"))
+
+
+@pytest.fixture(scope="session")
+def cuda_device() -> str:
+    """Device of tests marked `cuda`."""
+    return CUDA_DEVICE
+
 
 @pytest.fixture(scope="session")
 def gl() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import re
 import subprocess
+import sys
 import tomllib
 from dataclasses import fields, is_dataclass
 from functools import cache
@@ -27,7 +28,8 @@ _MAKE = re.compile(r"\bmake ([a-z-]+)")
 
 # Flags of `train` that stand for any field of the configs, and those of other programs.
 _ELSEWHERE = {"help", "seeds", "keyword", "output", "tag", "title", "group"}
-_INSTALLERS = {"extra", "overrides", "no-deps"}
+_INSTALLERS = {"extra", "overrides", "no-deps", "no-index", "only-binary", "find-links", "target"}
+_INSTALLERS |= {"dest", "python-version", "implementation", "platform"}
 _TORCHRUN = {"nnodes", "node-rank", "nproc-per-node", "rdzv-backend", "rdzv-endpoint", "rdzv-id"}
 
 
@@ -82,6 +84,12 @@ def _flags_of() -> dict[str, list[object]]:
     }
 
 
+def _flags_of_gpu() -> set[str]:
+    command = [sys.executable, str(ROOT / "benchmarks/gpu.py"), "--help"]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return set(_FLAG.findall(said))
+
+
 def _has(config: object, path: list[str]) -> bool:
     if not path:
         return True
@@ -105,12 +113,11 @@ def _unknown(command: str, text: str) -> set[str]:
 
 def test_flags_are_fields_of_the_commands() -> None:
     unknown = set()
+    elsewhere = _ELSEWHERE | _TORCHRUN | _INSTALLERS | _flags_of_gpu()
     for page in PAGES:
         code = _code(page.read_text(encoding="utf-8"))
         flags = set.intersection(*(_unknown(command, code) for command in _flags_of()))
-        unknown |= {
-            f"{page.name}: --{flag}" for flag in flags - _ELSEWHERE - _INSTALLERS - _TORCHRUN
-        }
+        unknown |= {f"{page.name}: --{flag}" for flag in flags - elsewhere}
     assert not unknown
 
 

@@ -67,7 +67,7 @@ class Pair:
         return self.native, self.warp
 
 
-def build(name: str) -> Pair:
+def build(name: str, device: str) -> Pair:
     disable = ("contact",) if name == "cartpole" else ()
     mujoco_cfg = MujocoCfg(timestep=0.004, disableflags=disable)
     sims = [
@@ -75,9 +75,9 @@ def build(name: str) -> Pair:
             NUM_ENVS,
             SimulationCfg(engine=engine, mujoco=mujoco_cfg, num_threads=1),
             spec=mujoco.MjSpec.from_string(MODELS[name]),
-            device="cpu",
+            device=device,
         )
-        for engine in ("native", "warp")
+        for engine, device in (("native", "cpu"), ("warp", device))
     ]
     pair = Pair(*sims, name, () if name == "landing_box" else SENSOR_FED)
     for sim in pair.both():
@@ -87,15 +87,24 @@ def build(name: str) -> Pair:
     return pair
 
 
-@pytest.fixture(scope="module", params=MODELS)
-def pair(request: pytest.FixtureRequest) -> Pair:
-    return build(request.param)
+# Each model with Warp on the CPU and, where there is one, on a GPU.
+CASES = [
+    *(pytest.param((name, False), id=name) for name in MODELS),
+    *(pytest.param((name, True), id=f"{name}-cuda", marks=pytest.mark.cuda) for name in MODELS),
+]
 
 
-@pytest.fixture(scope="module", params=MODELS)
-def changed(request: pytest.FixtureRequest) -> Pair:
+@pytest.fixture(scope="module", params=CASES)
+def pair(request: pytest.FixtureRequest, cuda_device: str) -> Pair:
+    name, on_cuda = request.param
+    return build(name, cuda_device if on_cuda else "cpu")
+
+
+@pytest.fixture(scope="module", params=CASES)
+def changed(request: pytest.FixtureRequest, cuda_device: str) -> Pair:
     """A pair whose environments differ in their model parameters, with constants recomputed."""
-    return randomize_models(build(request.param))
+    name, on_cuda = request.param
+    return randomize_models(build(name, cuda_device if on_cuda else "cpu"))
 
 
 def set_same_state(pair: Pair, seed: int = 0) -> None:
@@ -157,7 +166,7 @@ def assert_same(
     wrong = []
     for field in fields:
         native, warp = (
-            getattr(getattr(sim, struct), field)[rows or slice(None)] for sim in pair.both()
+            getattr(getattr(sim, struct), field)[rows or slice(None)].cpu() for sim in pair.both()
         )
         assert native.shape == warp.shape, f"{field}: {native.shape} and {warp.shape}"
         assert native.dtype == warp.dtype, f"{field}: {native.dtype} and {warp.dtype}"
@@ -253,15 +262,16 @@ def randomize_models(pair: Pair) -> Pair:
         sim.expand_model_fields((*scaled, *moved, "gravity"))
         for field in scaled:
             values = getattr(sim.model, field)
-            values.mul_(factors.view(-1, *[1] * (values.dim() - 1)))
+            values.mul_(factors.to(values).view(-1, *[1] * (values.dim() - 1)))
         for field in moved:
             values = getattr(sim.model, field)
             if field == "qpos0" and sim.mj_model.nq == 7:
                 values = values[:, :3]
             elif field.startswith("body_"):
                 values = values[:, 1:]
-            values.add_((factors - 1).view(-1, *[1] * (values.dim() - 1)) * 0.02)
-        sim.model.gravity[:, 2] *= factors
+            shift = 0.02 * (factors - 1).to(values)
+            values.add_(shift.view(-1, *[1] * (values.dim() - 1)))
+        sim.model.gravity[:, 2] *= factors.to(sim.device)
         sim.recompute_constants(3)
     return pair
 
@@ -306,11 +316,14 @@ def test_rays_and_jacobians_are_the_same(pair: Pair) -> None:
     origins = torch.tensor([[0.02, 0.01, 2.0], [0.0, -1.0, 0.5], [5.0, 5.0, 1.0]])
     directions = torch.tensor([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     rays = [
-        sim.raycast(origins.expand(NUM_ENVS, -1, -1), directions.expand(NUM_ENVS, -1, -1))
+        sim.raycast(
+            origins.expand(NUM_ENVS, -1, -1).to(sim.device),
+            directions.expand(NUM_ENVS, -1, -1).to(sim.device),
+        )
         for sim in pair.both()
     ]
     points = pair.native.data.xpos[:, -1] + 0.1
     bodies = torch.full((NUM_ENVS,), pair.native.mj_model.nbody - 1, dtype=torch.int32)
-    jacobians = [sim.jacobian(points, bodies) for sim in pair.both()]
+    jacobians = [sim.jacobian(points.to(sim.device), bodies.to(sim.device)) for sim in pair.both()]
     for native, warp in zip((*rays[0], *jacobians[0]), (*rays[1], *jacobians[1]), strict=True):
-        torch.testing.assert_close(warp, native, atol=PARITY_TOLERANCE, rtol=PARITY_TOLERANCE)
+        torch.testing.assert_close(warp.cpu(), native, atol=PARITY_TOLERANCE, rtol=PARITY_TOLERANCE)

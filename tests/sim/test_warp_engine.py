@@ -5,10 +5,12 @@ from __future__ import annotations
 import logging
 import subprocess
 import sys
+from contextlib import contextmanager
 
 import mujoco
 import pytest
 import torch
+from torch.overrides import TorchFunctionMode
 
 from mjlab.sim.config import MujocoCfg, SimulationCfg
 from mjlab.sim.engine import EngineUnavailableError
@@ -482,16 +484,76 @@ def test_warp_is_quiet_unless_asked_otherwise(
     assert (wp.config.log_level > wp.LOG_INFO) is quiet
 
 
+# Order of work. Warp's stream waits for what torch has queued when `_ordered` is entered: what torch
+# queued within, Warp might read before it is there.
+
+
+class _WorkOfTorch(TorchFunctionMode):
+    """Notes the functions of torch that compute while an engine is within `_ordered`."""
+
+    LOOKING = frozenset(
+        {
+            "__get__",
+            "__set__",
+            "as_tensor",
+            "data_ptr",
+            "stride",
+            "is_contiguous",
+            "dim",
+            "size",
+            "element_size",
+            "numel",
+        }
+        | {"requires_grad_", "view", "expand", "is_conj", "untyped_storage", "storage_offset"}
+    )
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_ordered = False
+        self.found: list[str] = []
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        if self.is_ordered and func.__name__ not in self.LOOKING:
+            self.found.append(func.__name__)
+        return func(*args, **(kwargs or {}))
+
+
+def test_torch_computes_nothing_that_warp_reads_within_the_same_wait() -> None:
+    engine = make_engine(LANDING_BOX)
+    work, ordered = _WorkOfTorch(), engine._ordered
+
+    @contextmanager
+    def noted():
+        with ordered():
+            work.is_ordered = True
+            yield
+            work.is_ordered = False
+
+    engine._ordered = noted
+    # Not contiguous and of other types, so that they have to be copied.
+    points = torch.zeros(3, 2).T
+    bodies = torch.tensor([[1, 0], [1, 0]])[:, 0]
+    rays = torch.zeros(3, 4, 2).permute(2, 1, 0)
+    with work:
+        engine.jacobian(points, bodies)
+        engine.raycast(rays, rays - 1.0, None, torch.ones(8, dtype=torch.int64)[::2])
+        engine.step(1)
+        engine.forward(torch.tensor([1]))
+        engine.reset(torch.tensor([0]))
+        engine.expand(("body_mass",))
+        engine.recompute_constants(3, torch.tensor([0]))
+    # What `expand` copies is queued on Warp's stream.
+    assert set(work.found) <= {"copy_"}
+
+
 # On a GPU, the captured graphs. These do not run where there is none.
 
-needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")
 
-
-@needs_gpu
+@pytest.mark.cuda
 @pytest.mark.parametrize("own_stream", [False, True])
-def test_graphs_on_the_gpu_compute_what_the_cpu_does(own_stream: bool) -> None:
+def test_graphs_on_the_gpu_compute_what_the_cpu_does(own_stream: bool, cuda_device: str) -> None:
     model = mujoco.MjModel.from_xml_string(LANDING_BOX)
-    engines = [WarpEngine(model, 3, SimulationCfg(), device) for device in ("cpu", "cuda:0")]
+    engines = [WarpEngine(model, 3, SimulationCfg(), device) for device in ("cpu", cuda_device)]
     stream = torch.cuda.Stream() if own_stream else torch.cuda.default_stream()
     with torch.cuda.stream(stream):
         for engine in engines:
@@ -508,10 +570,12 @@ def test_graphs_on_the_gpu_compute_what_the_cpu_does(own_stream: bool) -> None:
             torch.testing.assert_close(gpu, cpu, atol=1e-3, rtol=1e-3)
 
 
-@needs_gpu
-def test_a_step_on_the_gpu_does_not_wait_for_it() -> None:
-    engine = WarpEngine(mujoco.MjModel.from_xml_string(LANDING_BOX), 3, SimulationCfg(), "cuda:0")
-    ids = torch.tensor([1], device="cuda:0")
+@pytest.mark.cuda
+def test_a_step_on_the_gpu_does_not_wait_for_it(cuda_device: str) -> None:
+    engine = WarpEngine(
+        mujoco.MjModel.from_xml_string(LANDING_BOX), 3, SimulationCfg(), cuda_device
+    )
+    ids = torch.tensor([1], device=cuda_device)
     engine.step(2)
     engine.forward(None)
     engine.reset(ids)

@@ -470,14 +470,16 @@ class WarpEngine(Engine):
         shape = (self.num_envs, 3, self._sizes[0])
         translational = torch.empty(shape, device=self.device)
         rotational = torch.empty(shape, device=self.device)
+        # Copied before Warp's stream starts to wait for torch's, which it does only once.
+        points, body_ids = points.contiguous(), body_ids.to(torch.int32).contiguous()
         with self._ordered():
             mjwarp.jac(
                 self.wp_model,
                 self.wp_data,
                 wp.from_torch(translational),
                 wp.from_torch(rotational),
-                wp.from_torch(points.contiguous(), dtype=wp.vec3),
-                wp.from_torch(body_ids.to(torch.int32).contiguous()),
+                wp.from_torch(points, dtype=wp.vec3),
+                wp.from_torch(body_ids),
             )
         return translational, rotational
 

@@ -1,0 +1,113 @@
+"""Compiles Warp's kernels for all tasks, in processes side by side, so that later parts do not wait.
+
+Warp keeps what it has compiled in a folder of the user. `python -m gpu_parts.kernels TASK DEVICE NUM`
+compiles those of one task and prints the seconds.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+from report import Row
+
+from gpu_parts.options import Options
+from gpu_parts.tasks import (
+    CARTPOLE,
+    G1_FLAT,
+    G1_ROUGH,
+    GO1_FLAT,
+    GO1_ROUGH,
+    LIFT_CUBE,
+    LIFT_CUBE_RGB,
+    TRACKING,
+    make_env,
+)
+from gpu_parts.tests import missing_for_tests, pytest_command
+
+_TESTS = "tests marked `cuda`"
+_TASKS = (CARTPOLE, GO1_FLAT, G1_FLAT, LIFT_CUBE, LIFT_CUBE_RGB, TRACKING, GO1_ROUGH, G1_ROUGH)
+
+
+def measure(options: Options) -> Iterator[Row]:
+    """Compile; a row for each process, as it ends.
+
+    Raises:
+        RuntimeError: some of the processes failed; the others have ended then.
+    """
+    failed: list[str] = []
+    begin = time.monotonic()
+    with contextlib.ExitStack() as stack:
+        running: dict[str, tuple[subprocess.Popen[str], IO[str]]] = {}
+        for name, command in _commands(options).items():
+            # Into a file: the output of processes that wait for a reader would stop them.
+            log = stack.enter_context(tempfile.TemporaryFile("w+"))
+            process = subprocess.Popen(
+                command, cwd=Path(__file__).parents[1], stdout=log, stderr=log, text=True
+            )
+            stack.callback(process.wait)
+            stack.callback(process.kill)
+            running[name] = (process, log)
+        while running:
+            ended = [name for name, (process, _) in running.items() if process.poll() is not None]
+            for name in ended:
+                process, log = running.pop(name)
+                log.seek(0)
+                said = log.read()
+                # Whether tests pass is another part's question.
+                if process.returncode != 0 and name != _TESTS:
+                    failed.append(f"{name} ended with {process.returncode}:\n{said[-3000:]}")
+                    continue
+                yield Row(
+                    f"{name}: kernels compiled and loaded",
+                    f"after {time.monotonic() - begin:.0f} s",
+                    said.strip().rpartition("\n")[2],
+                    "",
+                    None,
+                )
+            time.sleep(0.2)
+    if failed:
+        raise RuntimeError("\n".join(failed))
+
+
+def _commands(options: Options) -> dict[str, list[str]]:
+    """Return a command for each task, and one that makes the steps of the tests."""
+    num_envs = str(options.sized(64, 2))
+    commands = {
+        task: [sys.executable, "-m", "gpu_parts.kernels", task, options.device, num_envs]
+        for task in options.sized(_TASKS, (CARTPOLE,))
+    }
+    if not options.tiny and not missing_for_tests():
+        commands[_TESTS] = pytest_command(options)
+    return commands
+
+
+def _compile(task: str, device: str, num_envs: int) -> None:
+    import torch
+
+    from gpu_parts.device import wait
+
+    begin = time.perf_counter()
+    env = make_env(task, num_envs, device)
+    actions = torch.zeros(num_envs, env.action_manager.total_action_dim, device=device)
+    env.step(actions)
+    wait(device)
+    first = time.perf_counter()
+    for _ in range(5):
+        env.step(actions)
+    # Resets of some environments and their randomization.
+    env.reset(env_ids=torch.tensor([0], device=device))
+    wait(device)
+    env.close()
+    after = time.perf_counter() - first
+    print(f"built, reset and stepped once in {first - begin:.1f} s; five more steps {after:.1f} s")
+
+
+if __name__ == "__main__":
+    _compile(sys.argv[1], sys.argv[2], int(sys.argv[3]))

@@ -1,0 +1,146 @@
+"""The proof on a GPU runs, in all its parts, and keeps what it has measured whatever happens."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+BENCHMARKS = ROOT / "benchmarks"
+PARTS = ("kernels", "tests", "parity", "speed", "learning", "cameras")
+
+# A part of an own making, in place of those that need torch.
+STUB = """
+import os, signal, subprocess, sys, time
+from report import Row
+
+
+def measure(options):
+    yield Row("first", "1", "", "", None)
+    {rest}
+"""
+ENDS = {
+    "kernels": 'yield Row("second", "2", "", "at least 1", True)',
+    "tests": 'yield Row("second", "2", "", "at least 3", False)',
+    "parity": 'raise ValueError("expected 3, got 2")',
+    "speed": "os.kill(os.getpid(), signal.SIGKILL)",
+    "learning": """
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    (options.output / "child").write_text(str(child.pid))
+    try:
+        child.wait()
+    finally:
+        child.kill()
+        child.wait()""",
+    "cameras": "import a_package_that_is_missing",
+}
+
+
+def run(folder: Path, *flags: str, timeout: float = 300.0) -> subprocess.CompletedProcess[str]:
+    # As on a machine where mjlab is not installed: `-P` and no path of this project.
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    command = [sys.executable, str(folder / "gpu.py"), *flags]
+    return subprocess.run(
+        command, capture_output=True, text=True, env=environment, timeout=timeout, cwd="/"
+    )
+
+
+def content(output: Path, part: str) -> dict[str, Any]:
+    return json.loads((output / f"{part}.json").read_text())
+
+
+def test_every_part_runs_on_the_cpu(tmp_path: Path) -> None:
+    done = run(BENCHMARKS, "--device", "cpu", "--tiny", "--in-process", "--output", str(tmp_path))
+    assert done.returncode == 0, done.stdout + done.stderr
+    for part in PARTS:
+        record = content(tmp_path, part)
+        assert record["status"] == "done"
+        assert record["machine"]["device"] == "cpu"
+        assert record["rows"]
+        table = (tmp_path / "table.md").read_text()
+        assert all(row["measured"] in table for row in record["rows"])
+    assert {path.name for path in tmp_path.iterdir()} == {"table.md", *(f"{p}.json" for p in PARTS)}
+    (tests,) = content(tmp_path, "tests")["rows"]
+    assert tests["reached"]
+    assert not tests["measured"].startswith("0 passed")
+    assert all(row["reached"] for row in content(tmp_path, "parity")["rows"])
+
+
+@pytest.fixture
+def stubs(tmp_path: Path) -> Path:
+    """The script, with parts that end in every way there is."""
+    folder = tmp_path / "benchmarks"
+    (folder / "gpu_parts").mkdir(parents=True)
+    for name in ("gpu.py", "report.py", "gpu_parts/__init__.py", "gpu_parts/options.py"):
+        shutil.copy(BENCHMARKS / name, folder / name)
+    (folder / "gpu_parts/machine.py").write_text("def described(device): return {'device': device}")
+    for part, rest in ENDS.items():
+        (folder / f"gpu_parts/{part}.py").write_text(STUB.format(rest=rest))
+    return folder
+
+
+def test_parts_that_fail_keep_their_rows_and_let_the_others_go_on(stubs: Path, tmp_path: Path):
+    output = tmp_path / "results"
+    done = run(stubs, "--minutes", "0.15", "--output", str(output))
+    assert done.returncode == 1
+    found = {part: content(output, part) for part in PARTS}
+    statuses = {part: record["status"] for part, record in found.items()}
+    assert statuses == {
+        **dict.fromkeys(("kernels", "tests"), "done"),
+        **dict.fromkeys(("parity", "speed"), "failed"),
+        "learning": "out of time",
+        "cameras": "not started: no time was left",
+    }
+    for part in PARTS[:-1]:
+        assert found[part]["rows"][0]["what"] == "first"
+    assert "expected 3, got 2" in found["parity"]["error"]
+    assert "-9" in found["speed"]["error"]
+    # What a part has started ends with it.
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((output / "child").read_text()), 0)
+    everything = (output / "table.md").read_text()
+    assert all(f"## {part}: {status}" in everything for part, status in statuses.items())
+    assert "Not passed: tests, parity, speed, learning, cameras." in done.stdout
+
+
+@pytest.mark.parametrize(("part", "status"), [("kernels", 0), ("tests", 1), ("cameras", 1)])
+def test_a_part_is_asked_for_alone(stubs: Path, tmp_path: Path, part: str, status: int) -> None:
+    output = tmp_path / "results"
+    begin = time.monotonic()
+    assert run(stubs, "--part", part, "--output", str(output)).returncode == status
+    assert time.monotonic() - begin < 30
+    assert [path.stem for path in output.glob("*.json")] == [part]
+    if part == "cameras":
+        assert "a_package_that_is_missing" in content(output, part)["error"]
+
+
+@pytest.mark.parametrize("flags", [("--part", "everything"), ("--device", "gpu")])
+def test_flags_that_say_nothing_are_refused(stubs: Path, flags: tuple[str, ...]) -> None:
+    done = run(stubs, *flags)
+    assert done.returncode != 0
+    assert flags[1] in done.stderr
+
+
+def test_another_engine_that_computes_something_else_is_told(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    from gpu_parts import parity
+    from gpu_parts.tasks import CARTPOLE, make_env
+
+    native, other = (make_env(CARTPOLE, 4, "cpu", "native") for _ in range(2))
+    same = list(parity.compare(CARTPOLE, native, other, 2))
+    assert [row.reached for row in same] == [True, True]
+    assert "largest 0.0" in same[1].measured
+    other.sim.expand_model_fields(("dof_damping",))
+    other.sim.model.dof_damping.add_(5.0)
+    assert [row.reached for row in parity.compare(CARTPOLE, native, other, 2)] == [True, False]
+    monkeypatch.setattr(parity, "_STATE", ("qvel",))
+    other.sim.reset()
+    assert [row.reached for row in parity.compare(CARTPOLE, native, other, 2)] == [False, False]
