@@ -11,7 +11,7 @@ import copy
 from collections.abc import Iterator, Mapping
 from dataclasses import is_dataclass
 from types import NoneType
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 C = TypeVar("C")
 
@@ -92,11 +92,13 @@ def _term_at(config: Any, flag: str) -> tuple[Any, str]:
 
 
 def _may_be_none(holder: Any, key: str) -> bool:
-    """Return True if field `key` of a config is declared as another config or None."""
+    """Return True if field `key` of a config is declared as a config, or a dict of one, or None."""
     if not is_dataclass(holder):
         return False
     options = get_args(get_type_hints(type(holder)).get(key))
-    return NoneType in options and any(is_dataclass(option) for option in options)
+    return NoneType in options and any(
+        is_dataclass(option) or get_origin(option) is dict for option in options
+    )
 
 
 def _spelled_alike(name: Any, part: str) -> bool:
