@@ -123,7 +123,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             env, self.alg, self.cfg.get("evaluation") or {}, int(self.cfg.get("seed", 0))
         )
         self._num_threads = self._resolve_threads()
-        self._speeds = SpeedWatch(env.unwrapped)
+        self._speeds = SpeedWatch(self.env.unwrapped)
 
     # The training loop.
 
