@@ -236,8 +236,8 @@ def test_an_environment_that_is_done_starts_anew_in_the_same_step(make):
     observations, _, _, truncated, extras = env.step(actions(1)[0])
     assert truncated.tolist() == [False] * 3 + [True] + [False] * 2
     assert env.episode_length_buf.tolist() == [6, 6, 6, 0, 6, 6]
-    # What is observed belongs to the new episode: the cart in the middle, the pole hanging.
-    assert observations["actor"][3, 0] == 0.0
+    # What is observed belongs to the new episode: the cart near the middle, the pole hanging.
+    assert abs(observations["actor"][3, 0]) <= 0.1
     assert observations["actor"][3, 1].item() == pytest.approx(-1.0, abs=1e-3)
     assert any(name.startswith("Episode_") for name in extras["log"])
 

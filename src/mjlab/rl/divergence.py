@@ -86,8 +86,8 @@ class SpeedWatch:
             "position actuator on a light link diverges at a coarse step. Use a smaller "
             f"sim.mujoco.timestep, or give the joint more armature (now "
             f"{float(model.dof_armature[worst]):g}) or viscous_damping (now "
-            f"{float(model.dof_damping[worst]):g}), or its actuator a larger effort_limit or less "
-            f"stiffness and damping{other}."
+            f"{float(model.dof_damping[worst]):g}), or its actuator less stiffness and damping or no "
+            f"effort_limit{other}."
         )
 
 
