@@ -311,9 +311,7 @@ def try_package(package: Package, engine: str, seconds: float) -> list[Trial]:
     return trials
 
 
-def _watch(
-    package: Package, engine: str, seconds: float, folder: str, trials: list[Trial]
-) -> bool:
+def _watch(package: Package, engine: str, seconds: float, folder: str, trials: list[Trial]) -> bool:
     """Run one process, adding to `trials`; return True if no task remains."""
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
