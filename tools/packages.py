@@ -9,6 +9,7 @@ a Markdown table with a row per task and engine. The exit status is 1 if a row h
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import json
 import multiprocessing
@@ -22,17 +23,18 @@ import traceback
 import warnings
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import PackageNotFoundError, entry_points, requires, version
+from importlib.metadata import entry_points, requires, version
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 from packaging.requirements import InvalidRequirement, Requirement
 
 OWN_PACKAGES = Path(__file__).parents[1] / "tests" / "packages"
 GROUP = "mjlab.tasks"
 STAGES = ("import", "build", "step", "train")
-ENGINES = ("native", "warp")
+Engine = Literal["native", "warp"]
+ENGINES = get_args(Engine)
 
 NUM_ENVS = 4
 NUM_STEPS = 8
@@ -107,15 +109,18 @@ def read_package(folder: Path) -> Package:
 
 
 def _mjlab_requirement(dependencies: list[str]) -> str | None:
-    for dependency in dependencies:
-        try:
-            requirement = Requirement(dependency)
-        except InvalidRequirement:
-            continue
+    for requirement in _parse(dependencies):
         # A requirement on a URL or a path has no version.
         if requirement.name == "mjlab" and requirement.url is None:
             return str(requirement)
     return None
+
+
+def _parse(dependencies: list[str]) -> Iterator[Requirement]:
+    for dependency in dependencies:
+        # Templates of project files are at times not filled in.
+        with contextlib.suppress(InvalidRequirement):
+            yield Requirement(dependency)
 
 
 @dataclass
@@ -125,7 +130,7 @@ class Trial:
     package: str
     requirement: str | None
     satisfied: bool | None
-    engine: str
+    engine: Engine
     task: str | None = None
     passed: list[str] = field(default_factory=list)
     """Stages passed, of `import`, `build`, `step` and `train`."""
@@ -144,7 +149,7 @@ class Trial:
 
 
 class _Worker:
-    def __init__(self, connection: Connection, package: Package, engine: str) -> None:
+    def __init__(self, connection: Connection, package: Package, engine: Engine) -> None:
         self._connection = connection
         self._package = package
         self._engine = engine
@@ -167,7 +172,9 @@ class _Worker:
     def _send(self, event: str, value: Any) -> None:
         self._connection.send((event, value))
 
-    def _report_warning(self, message: Any, category: type, filename: str, *_: Any) -> None:
+    def _report_warning(
+        self, message: Warning | str, category: type[Warning], filename: str, *_: Any, **__: Any
+    ) -> None:
         # mjlab warns of older names with FutureWarning, and of replaced values with UserWarning.
         if not issubclass(category, FutureWarning | UserWarning) or str(message) in self._warned:
             return
@@ -275,11 +282,7 @@ def _missing_dependency(error: BaseException | None, package: Package) -> str | 
 
 
 def _extra_with(distribution: str) -> str | None:
-    try:
-        declared = [Requirement(text) for text in requires("mjlab") or ()]
-    except PackageNotFoundError:
-        return None
-    for requirement in declared:
+    for requirement in _parse(requires("mjlab") or []):
         if requirement.name == distribution and requirement.marker:
             match = re.search(r"extra == ['\"]([\w-]+)['\"]", str(requirement.marker))
             if match:
@@ -288,7 +291,7 @@ def _extra_with(distribution: str) -> str | None:
 
 
 def _work(
-    connection: Connection, package: Package, engine: str, done: list[str], folder: str
+    connection: Connection, package: Package, engine: Engine, done: list[str], folder: str
 ) -> None:
     os.chdir(folder)
     # What packages print must not get between the lines of the table.
@@ -301,7 +304,7 @@ def _work(
 # The process that watches.
 
 
-def try_package(package: Package, engine: str, seconds: float) -> list[Trial]:
+def try_package(package: Package, engine: Engine, seconds: float) -> list[Trial]:
     """Try all tasks of a package on an engine, each for at most `seconds`."""
     trials: list[Trial] = []
     with tempfile.TemporaryDirectory() as folder:
@@ -311,7 +314,7 @@ def try_package(package: Package, engine: str, seconds: float) -> list[Trial]:
     return trials
 
 
-def _watch(package: Package, engine: str, seconds: float, folder: str, trials: list[Trial]) -> bool:
+def _watch(package: Package, engine: Engine, seconds: float, folder: str, trials: list[Trial]) -> bool:
     """Run one process, adding to `trials`; return True if no task remains."""
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)

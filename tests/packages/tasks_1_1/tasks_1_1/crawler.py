@@ -63,17 +63,18 @@ def get_crawler_cfg() -> EntityCfg:
 def crawler_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     cfg = make_velocity_env_cfg()
     cfg.scene.entities = {"robot": get_crawler_cfg()}
-    cfg.scene.sensors = (
-        ContactSensorCfg(
-            name="feet_ground_contact",
-            primary=ContactMatch(mode="geom", pattern=_FOOT_GEOMS, entity="robot"),
-            secondary=ContactMatch(mode="body", pattern="terrain"),
-            fields=("found", "force"),
-            reduce="netforce",
-            num_slots=1,
-            track_air_time=True,
-        ),
+    feet_ground = ContactSensorCfg(
+        name="feet_ground_contact",
+        primary=ContactMatch(mode="geom", pattern=_FOOT_GEOMS, entity="robot"),
+        secondary=ContactMatch(mode="body", pattern="terrain"),
+        fields=("found", "force"),
+        reduce="netforce",
+        num_slots=1,
+        track_air_time=True,
     )
+    # The template of this release brings one sensor, the scan of the terrain.
+    kept = tuple(sensor for sensor in cfg.scene.sensors if sensor.name != "terrain_scan")
+    cfg.scene.sensors = (*kept, feet_ground)
     cfg.scene.terrain.terrain_type = "plane"
     cfg.scene.terrain.terrain_generator = None
     for group in cfg.observations.values():

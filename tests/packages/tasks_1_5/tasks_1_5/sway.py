@@ -176,9 +176,7 @@ def sway_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
             )
         },
         events={
-            "reset": EventTermCfg(
-                func=reset_joints_together, mode="reset", params={"spread": 0.2}
-            )
+            "reset": EventTermCfg(func=reset_joints_together, mode="reset", params={"spread": 0.2})
         },
         rewards={
             "follow": RewardTermCfg(
