@@ -158,7 +158,7 @@ class _Worker:
     def run(self, done: list[str]) -> None:
         """Import the package and try its tasks but those `done`."""
         warnings.simplefilter("always")
-        warnings.showwarning = self._report_warning
+        warnings.showwarning = self._report_warning  # ty: ignore[invalid-assignment]
         try:
             tasks = self._import()
         except (Exception, SystemExit) as error:
@@ -172,9 +172,7 @@ class _Worker:
     def _send(self, event: str, value: Any) -> None:
         self._connection.send((event, value))
 
-    def _report_warning(
-        self, message: Warning | str, category: type[Warning], filename: str, *_: Any, **__: Any
-    ) -> None:
+    def _report_warning(self, message: Any, category: type, filename: str, *_: Any) -> None:
         # mjlab warns of older names with FutureWarning, and of replaced values with UserWarning.
         if not issubclass(category, FutureWarning | UserWarning) or str(message) in self._warned:
             return
@@ -314,7 +312,9 @@ def try_package(package: Package, engine: Engine, seconds: float) -> list[Trial]
     return trials
 
 
-def _watch(package: Package, engine: Engine, seconds: float, folder: str, trials: list[Trial]) -> bool:
+def _watch(
+    package: Package, engine: Engine, seconds: float, folder: str, trials: list[Trial]
+) -> bool:
     """Run one process, adding to `trials`; return True if no task remains."""
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)

@@ -61,7 +61,7 @@ class SmoothVelocityCommandCfg(UniformVelocityCommandCfg):
 
 
 def _wheel_sites() -> SceneEntityCfg:
-    return SceneEntityCfg("robot", site_names=_WHEELS)
+    return SceneEntityCfg("robot", site_names=(".*_tread",))
 
 
 _SENSORS = (
