@@ -170,6 +170,7 @@ def steps_counted(env) -> torch.Tensor:
 
 def truncated_now(env) -> torch.Tensor:
     """Return 1 where the episode ran out of time in this step."""
+    assert len(env.observation_manager._group_obs_term_cfgs["actor"]) == 4
     return env.termination_manager._truncated_buf.float()
 
 
