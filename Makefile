@@ -2,7 +2,7 @@
 UV := ./tools/uv
 DEV := $(UV) run --group dev
 
-.PHONY: help train test test-slow check format bench gpu docs
+.PHONY: help train test test-slow check format bench gpu packages docs
 
 help:  ## Show this list.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -35,6 +35,9 @@ DEVICE ?= cuda:0
 
 gpu:  ## Test and measure on an NVIDIA GPU, in ten minutes; PARTS="parity speed" for some parts.
 	$(PYTHON) benchmarks/gpu.py --device $(DEVICE) $(if $(PARTS),--part $(PARTS)) $(GPU_FLAGS)
+
+packages:  ## Try task packages: make packages DIRS="../a ../b"; without DIRS, those of the tests.
+	$(DEV) python tools/packages.py $(DIRS) $(if $(ENGINES),--engines $(ENGINES))
 
 docs:  ## Build the documentation into docs/_build/html.
 	$(UV) run --group docs sphinx-build -W --keep-going -b html docs docs/_build/html

@@ -20,7 +20,7 @@ import importlib
 import inspect
 import warnings
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 C = TypeVar("C", bound=type)
 T = TypeVar("T")
@@ -516,6 +516,19 @@ def _with_either(signature: inspect.Signature, sensor: str) -> inspect.Signature
     keyword_only = inspect.Parameter.KEYWORD_ONLY
     parameters.setdefault("asset_cfg", inspect.Parameter("asset_cfg", keyword_only, default=None))
     return signature.replace(parameters=list(parameters.values()))
+
+
+def offers_older_sites(make_cfg: T) -> T:
+    """Decorator for the velocity template: its terms about feet take sites, as in 1.1 and 1.2."""
+    make: Any = make_cfg
+
+    @functools.wraps(make)
+    def template() -> Any:
+        cfg = make()
+        _load("mjlab.compat.older_terms:offer_sites")(cfg)
+        return cfg
+
+    return cast(T, template)
 
 
 def _load(path: str) -> Any:

@@ -9,6 +9,7 @@ Foot terms of 1.1 and 1.2 read the heights of sites above z = 0 instead of a hei
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,7 @@ from mjlab.tasks.velocity.mdp.sensor_checks import site_columns
 from mjlab.utils.state import capture_state, restore_state
 
 if TYPE_CHECKING:
-    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 
 _ROBOT = SceneEntityCfg("robot")
 _PHYSICS = ("qpos", "qvel", "mocap_pos", "mocap_quat")
@@ -168,3 +169,50 @@ class feet_swing_height(feet_rewards.feet_swing_height):
         env: ManagerBasedRlEnv, params: dict[str, Any]
     ) -> tuple[str, list[tuple[str, int]]]:
         return "the selection of sites", site_columns(env, params["asset_cfg"])
+
+
+class _FeetParams(dict[str, Any]):
+    """Parameters of a template's term that reads `asset_cfg` where today there is a height sensor.
+
+    Reading `asset_cfg` turns all terms of the template that read the sensor into older ones.
+    """
+
+    template: ManagerBasedRlEnvCfg | None = None
+
+    def __missing__(self, key: str) -> Any:
+        if key != "asset_cfg" or self.template is None:
+            raise KeyError(key)
+        _remove_height_sensor(self.template)
+        self[key] = SceneEntityCfg("robot", site_names=())
+        return self[key]
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _FeetParams:
+        copied = _FeetParams({key: copy.deepcopy(value, memo) for key, value in self.items()})
+        # A copy of the whole template refers to itself; a copy of the term alone to none.
+        copied.template = memo.get(id(self.template))
+        return copied
+
+
+_HEIGHT_SENSOR = "foot_height_scan"
+
+
+def offer_sites(template: ManagerBasedRlEnvCfg) -> None:
+    """Let packages set sites of feet in the velocity template, as those of 1.1 and 1.2 do."""
+    for term in _height_terms(template):
+        term.params = _FeetParams(term.params)
+        term.params.template = template
+
+
+def _height_terms(template: ManagerBasedRlEnvCfg) -> list[Any]:
+    terms: list[Any] = list(template.rewards.values())
+    for group in template.observations.values():
+        terms += group.terms.values() if group else ()
+    return [term for term in terms if term and _HEIGHT_SENSOR in term.params.values()]
+
+
+def _remove_height_sensor(template: ManagerBasedRlEnvCfg) -> None:
+    for term in _height_terms(template):
+        for key in [key for key, value in term.params.items() if value == _HEIGHT_SENSOR]:
+            del term.params[key]
+    sensors = template.scene.sensors
+    template.scene.sensors = tuple(cfg for cfg in sensors if cfg.name != _HEIGHT_SENSOR)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +13,7 @@ from stand_ins import StandInEnv, contacts
 from mjlab import compat
 from mjlab.managers import ObservationTermCfg, RewardTermCfg, SceneEntityCfg
 from mjlab.tasks.velocity import mdp
+from mjlab.tasks.velocity.velocity_env_cfg import make_velocity_env_cfg
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning")
 
@@ -129,3 +131,37 @@ def test_sites_of_other_feet_than_the_contacts_are_refused(make_env):
 
     with pytest.raises(ValueError, match="same feet"):
         make_env(edit=edit)
+
+
+def _feet_terms(cfg) -> list[Any]:
+    critic = cfg.observations["critic"].terms
+    return [critic["foot_height"], cfg.rewards["foot_clearance"], cfg.rewards["foot_swing_height"]]
+
+
+@pytest.mark.parametrize("prepare", [lambda cfg: cfg, copy.deepcopy], ids=["new", "copied"])
+def test_setting_sites_in_the_template_removes_its_height_sensor(prepare):
+    cfg = prepare(make_velocity_env_cfg())
+    sensors = [sensor.name for sensor in cfg.scene.sensors]
+    assert "foot_height_scan" in sensors
+    for term in _feet_terms(cfg):
+        term.params["asset_cfg"].site_names = ("left", "right")
+    for term in _feet_terms(cfg):
+        assert "foot_height_scan" not in term.params.values()
+        assert term.params["asset_cfg"].site_names == ("left", "right")
+    assert _feet_terms(cfg)[2].params["sensor_name"] == "feet_ground_contact"
+    left = [sensor.name for sensor in cfg.scene.sensors]
+    assert left == [name for name in sensors if name != "foot_height_scan"]
+
+
+def test_a_template_whose_sites_are_not_asked_for_keeps_its_sensor():
+    cfg = make_velocity_env_cfg()
+    cfg.rewards["foot_clearance"].params["asset_cfg"].site_names = ("left", "right")
+    alone = copy.deepcopy(cfg.observations["critic"].terms["foot_height"])
+    for params in (cfg.observations["critic"].terms["foot_height"].params, alone.params):
+        assert params == {"sensor_name": "foot_height_scan"}
+        assert "asset_cfg" not in params
+        with pytest.raises(KeyError, match="no_such_parameter"):
+            params["no_such_parameter"]
+    with pytest.raises(KeyError, match="asset_cfg"):
+        alone.params["asset_cfg"]
+    assert "foot_height_scan" in [sensor.name for sensor in cfg.scene.sensors]

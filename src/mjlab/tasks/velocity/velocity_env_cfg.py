@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import math
 
+from mjlab.compat import offers_older_sites
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.managers import (
     ActionTermCfg,
@@ -41,6 +42,7 @@ from mjlab.viewer import ViewerConfig
 _NO_NAMES: tuple[str, ...] = ()
 
 
+@offers_older_sites
 def make_velocity_env_cfg() -> ManagerBasedRlEnvCfg:
     """Return a new config of the task on rough terrain, without a robot.
 
