@@ -12,6 +12,7 @@ from sphinx.application import Sphinx
 from sphinx.ext.napoleon import Config, GoogleDocstring
 
 from mjlab.envs.mdp.dr._table import TABLE
+from mjlab.tasks.velocity import mdp as velocity_mdp
 
 _ROOT = Path(__file__).resolve().parents[1]
 
@@ -32,6 +33,11 @@ autodoc_typehints = "signature"
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 python_use_unqualified_type_names = True
+
+# Terms that take older parameters too are shown with today's: Sphinx reads defaults from the source.
+for _term in vars(velocity_mdp).values():
+    if hasattr(_term, "__wrapped__") and "__signature__" in vars(_term):
+        del _term.__signature__
 
 # How docstrings are written: sections as Google has them, and `Params`, the section of class-based
 # terms, whose parameters are given in a config.
