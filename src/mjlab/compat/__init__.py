@@ -278,7 +278,7 @@ _OLDER_METHODS: dict[str, dict[str, tuple[str, str]]] = {
     "CommandTerm": {
         "_update_command": ("env_ids", "mjlab.compat.older_terms:update_command"),
         "compute": ("env_ids", "mjlab.compat.older_terms:compute"),
-        "create_gui": ("on_change", "mjlab.compat.older_terms:create_gui"),
+        "create_gui": ("request_action", "mjlab.compat.older_terms:create_gui"),
     },
 }
 # Terms that read sites of `asset_cfg` before they read a sensor: the parameter that names the
@@ -312,7 +312,7 @@ def older_names(module_name: str) -> Callable[[str], Any]:
         if home == _OLDER:
             message = f"{module_name}.{name} is an older name, and is removed in mjlab 2.0."
         if inspect.isfunction(value):
-            return _warning_when_called(value, message)
+            return _warning_when_called(value, module_name, name, message)
         _warn_once(message)
         return value
 
@@ -345,13 +345,19 @@ def _calling(older_name: str, path: str) -> Callable[..., Any]:
     return older
 
 
-def _warning_when_called(function: Callable[..., Any], message: str) -> Callable[..., Any]:
+@functools.cache
+def _warning_when_called(
+    function: Callable[..., Any], module_name: str, name: str, message: str
+) -> Callable[..., Any]:
+    """Return a function that is the same object at each access, and is pickled by its older name."""
+
     # `wraps` also carries over what the function declares: the model fields it randomizes.
     @functools.wraps(function)
     def older(*args: Any, **kwargs: Any) -> Any:
         _warn_once(message)
         return function(*args, **kwargs)
 
+    older.__module__, older.__name__, older.__qualname__ = module_name, name, name
     return older
 
 
@@ -384,6 +390,16 @@ def accepts_older_fields(config_class: C) -> C:
     plain_init = cls.__init__
     positions = [field.name for field in dataclasses.fields(cls) if field.init]
 
+    def assume(name: str) -> Any:
+        value = defaults[name]
+        _warn_once(f"{cls.__name__}.{name} is required today; {value!r} is assumed.")
+        return value
+
+    for field in dataclasses.fields(cls):
+        if field.name in defaults:
+            # For `__init__` that `@dataclass` generates in subclasses. That of `cls` exists already.
+            field.default_factory = functools.partial(assume, field.name)
+
     @functools.wraps(plain_init)
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:
         for name in [name for name in dropped if name in kwargs]:
@@ -392,10 +408,9 @@ def accepts_older_fields(config_class: C) -> C:
             _warn_once(f"{cls.__name__}.{name} is an older field; today use {today}.")
             if translate is not None:
                 translate(value, kwargs)
-        for name, value in defaults.items():
+        for name in defaults:
             if name not in kwargs and name not in positions[: len(args)]:
-                kwargs[name] = value
-                _warn_once(f"{cls.__name__}.{name} has to be given today; {value!r} is assumed.")
+                kwargs[name] = assume(name)
         plain_init(self, *args, **kwargs)
 
     cls.__init__ = __init__
@@ -437,13 +452,13 @@ def accept_older_methods(base: type, subclass: type) -> None:
 
 
 def _takes(method: Callable[..., Any], argument: str, position: int) -> bool:
-    """Return whether a method takes an argument by position, under that name or as a required one."""
+    """Return whether a method takes an argument at its position, by name or as a required one."""
     parameters = inspect.signature(method).parameters.values()
     if any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters):
         return True
     positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     required = [p for p in positional if p.default is p.empty]
-    return len(required) > position or any(p.name == argument for p in positional)
+    return len(required) > position or argument in [p.name for p in positional[position:][:1]]
 
 
 def _called_as_today(method: Any, argument: str, caller: str) -> Callable[..., Any]:
@@ -481,8 +496,10 @@ def accepts_older_params(term: T) -> T:
 
     if inspect.isclass(term):
         # Python initializes what `__new__` returns as what it is: the older term is a subclass.
-        def __new__(today: type, cfg: Any, env: Any) -> Any:
-            return object.__new__(_load(path) if today is cls and is_older(cfg.params) else today)
+        # Copies are made without arguments, and of the class that they are.
+        def __new__(today: type, cfg: Any = None, env: Any = None) -> Any:
+            older = today is cls and cfg is not None and is_older(cfg.params)
+            return object.__new__(_load(path) if older else today)
 
         cls.__new__ = __new__
         return term

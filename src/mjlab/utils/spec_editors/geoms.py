@@ -128,7 +128,7 @@ class CollisionCfg(SpecCfg):
             field: [name for name, value in zip(names, values, strict=True) if value is None]
             for field, values in found.items()
         }
-        defaults = older_defaults(type(self), missing)
+        defaults = older_defaults(CollisionCfg, missing)
         return {
             field: [defaults[field] if value is None else value for value in values]
             for field, values in found.items()
