@@ -81,6 +81,50 @@ def test_every_tag_of_rsl_rl_is_written_with_its_value_and_step(rnd, entry, caps
         assert written[key] == pytest.approx(value, rel=1e-5), key
 
 
+def finish(logger: Any, it: int) -> None:
+    logger.finish_iteration(
+        iteration=it, first_iteration=it, total_iterations=9, losses={}, collection_time=0.8,
+        learning_time=0.7, rnd_weight=0.1, **REPORT,
+    )  # fmt: skip
+
+
+def test_a_resumed_run_goes_on_with_both_parts_of_the_reward():
+    whole, first, resumed = (make_logger(RunLogger, rnd=True) for _ in range(3))
+    for seed in (1, 2):
+        for logger in (whole, first):
+            feed(logger, True, seed)
+            finish(logger, seed)
+    resumed.load_state_dict(first.state_dict())
+    for logger in (whole, resumed):
+        feed(logger, True, 0)
+        finish(logger, 3)
+        feed(logger, True, 4)
+        finish(logger, 4)
+    for it in (3, 4):
+        for part in ("mean_reward", "mean_extrinsic_reward", "mean_intrinsic_reward"):
+            key = ("Train" if part == "mean_reward" else "Rnd") + f"/{part}", it
+            assert resumed.writer.figures[key] == whole.writer.figures[key]
+
+
+@pytest.mark.parametrize("saved_with_rnd", [False, True])
+@pytest.mark.parametrize("entry", ["finish_iteration", "log"])
+def test_checkpoints_without_the_parts_of_the_reward_are_resumed(saved_with_rnd, entry, capsys):
+    first, resumed = make_logger(RunLogger, saved_with_rnd), make_logger(RunLogger, rnd=True)
+    feed(first, saved_with_rnd, 1)
+    finish(first, 1)
+    state = first.state_dict()
+    resumed.load_state_dict({key: value for key, value in state.items() if "trinsic" not in key})
+    # No episode ends, then some do.
+    for it in (0, 2):
+        feed(resumed, True, it)
+        if entry == "log":
+            resumed.log(it, 0, 9, 0.8, 0.7, {}, rnd_weight=0.1, **REPORT)
+        else:
+            finish(resumed, it)
+    assert ("Train/mean_step_reward", 0) in resumed.writer.figures
+    assert ("Rnd/mean_extrinsic_reward", 2) in resumed.writer.figures
+
+
 def test_the_type_is_known_once_there_is_a_writer(make_runner, tmp_path: Path):
     runner = make_runner(tmp_path / "run")
     assert runner.logger.logger_type is None

@@ -54,7 +54,7 @@ class RunLogger(Logger):
 
     @property
     def logger_type(self) -> str | None:
-        """Service that figures go to, as the config names it (`tensorboard`, `wandb`, ...).
+        """Logging service, as the config names it (`tensorboard`, `wandb`, ...).
 
         None until `init_logging_writer` has opened one, and in processes that write nothing.
         """
@@ -262,7 +262,7 @@ class RunLogger(Logger):
 
     def state_dict(self) -> dict[str, Any]:
         """Return what the curves of a resumed run need to go on as they were."""
-        return {
+        state: dict[str, Any] = {
             "total_steps": self.tot_timesteps,
             "total_time": self.tot_time,
             "rewards": list(self.rewbuffer),
@@ -270,17 +270,35 @@ class RunLogger(Logger):
             "reward_sums": self.cur_reward_sum.clone(),
             "episode_lengths": self.cur_episode_length.clone(),
         }
+        if self._uses_rnd:
+            state |= {
+                "extrinsic_rewards": list(self.erewbuffer),
+                "intrinsic_rewards": list(self.irewbuffer),
+                "extrinsic_reward_sums": self.cur_ereward_sum.clone(),
+                "intrinsic_reward_sums": self.cur_ireward_sum.clone(),
+            }
+        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore `state_dict` of a run with as many environments."""
         self.load_totals(state)
         self.cur_reward_sum.copy_(state["reward_sums"])
         self.cur_episode_length.copy_(state["episode_lengths"])
+        if self._uses_rnd and "extrinsic_reward_sums" in state:
+            self.cur_ereward_sum.copy_(state["extrinsic_reward_sums"])
+            self.cur_ireward_sum.copy_(state["intrinsic_reward_sums"])
 
     def load_totals(self, state: dict[str, Any]) -> None:
         """Restore of `state_dict` what does not depend on the number of environments."""
         self.tot_timesteps = state["total_steps"]
         self.tot_time = state["total_time"]
+        if self._uses_rnd:
+            if "extrinsic_rewards" not in state:
+                # Of an earlier version, or without RND. rsl_rl averages the parts of the reward
+                # wherever it averages the reward, so all of them start with the next episodes.
+                return
+            self.erewbuffer.extend(state["extrinsic_rewards"])
+            self.irewbuffer.extend(state["intrinsic_rewards"])
         self.rewbuffer.extend(state["rewards"])
         self.lenbuffer.extend(state["lengths"])
 
