@@ -19,6 +19,7 @@ from mjlab.managers import (
 )
 from mjlab.rl import MjlabOnPolicyRunner, RslRlOnPolicyRunnerCfg, RslRlVecEnvWrapper
 from mjlab.rl.divergence import DivergedError
+from mjlab.rl.progress import TrainingObserver
 from mjlab.scene import SceneCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
 
@@ -88,6 +89,28 @@ def test_what_the_message_advises_cures_it(make_runner, cure):
     runner = make_runner(**cure)
     runner.learn(2)
     assert runner.current_learning_iteration == 2
+
+
+class BreaksPolicy(TrainingObserver):
+    """Leaves between two iterations what a diverged rollout may: a policy of NaN, and slow joints."""
+
+    def __init__(self, runner):
+        self.runner = runner
+
+    def on_iteration(self, stats):
+        self.runner.env.unwrapped.sim.data.qvel.zero_()
+        with torch.no_grad():
+            next(self.runner.alg.get_policy().parameters()).fill_(float("nan"))
+
+
+def test_nan_at_the_first_action_of_the_next_rollout_is_explained(make_runner):
+    runner = make_runner(armature=0.01)
+    # Too fast for the time step, though not enough to break the policy within the first rollout.
+    runner.env.unwrapped.sim.data.qvel[:, 2] = 200.0
+    runner.observers.append(BreaksPolicy(runner))
+    with pytest.raises(DivergedError, match=r"joint 'robot/.*' reached .* rad/s"):
+        runner.learn(2)
+    assert runner.current_learning_iteration == 1
 
 
 def test_a_policy_that_breaks_on_its_own_keeps_its_error(make_runner):

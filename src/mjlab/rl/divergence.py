@@ -22,8 +22,9 @@ class DivergedError(RuntimeError):
 
 
 class SpeedWatch:
-    """Highest speed of each degree of freedom since the start of a rollout.
+    """Highest speed of each degree of freedom in this rollout and the one before.
 
+    The policy learns from a rollout after it, so the first NaN may appear in the next one.
     Watching costs two small operations on the device of the environments, and no synchronization.
     """
 
@@ -31,14 +32,15 @@ class SpeedWatch:
         """Watch `env`; one without a simulation is left alone."""
         self._sim: Any = getattr(env, "sim", None)
         self._peak: torch.Tensor | None = None
+        self._previous_peak: torch.Tensor | None = None
 
     def start(self) -> None:
-        """Forget the speeds of earlier rollouts."""
+        """Begin a rollout with the current speeds."""
         if self._sim is not None:
-            self._peak = self._speeds()
+            self._previous_peak, self._peak = self._peak, self._speeds()
 
     def update(self) -> None:
-        """Take up the speeds after a step."""
+        """Update the highest speeds after a step."""
         if self._peak is not None:
             torch.maximum(self._peak, self._speeds(), out=self._peak)
 
@@ -66,7 +68,10 @@ class SpeedWatch:
             return None
         model: mujoco.MjModel = self._sim.mj_model
         timestep = float(model.opt.timestep)
-        speeds = self._peak.maximum(self._speeds()).nan_to_num(nan=math.inf).tolist()
+        peak = self._peak.maximum(self._speeds())
+        if self._previous_peak is not None:
+            peak = peak.maximum(self._previous_peak)
+        speeds = peak.nan_to_num(nan=math.inf).tolist()
         excess = [
             speed * timestep / (_METER if _is_linear(model, dof) else _HALF_TURN)
             for dof, speed in enumerate(speeds)
