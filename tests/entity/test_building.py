@@ -127,10 +127,29 @@ def test_an_actuator_beside_one_of_the_xml_is_accepted_with_a_warning_and_both_a
     assert sim.data.qfrc_actuator[0, -1].item() == pytest.approx(0.5 + 2.0)
 
 
-def test_an_actuator_with_the_name_of_one_of_the_xml_is_refused(kit):
-    xml = kit.ROBOT.replace("</mujoco>", IN_XML.replace("drive", "knee"))
-    with pytest.raises(ValueError, match="'knee' has the actuator 'knee' of the XML"):
+@pytest.mark.parametrize(
+    "names", [("knee",), ("drive", "knee"), ("knee", "drive"), ("", "knee", "drive")]
+)
+def test_an_actuator_with_the_name_of_one_of_the_xml_is_refused(kit, names):
+    motors = "".join(f'<motor name="{name}" joint="knee"/>' for name in names)
+    motors = motors.replace('name="" ', "")
+    xml = kit.ROBOT.replace("</mujoco>", f"<actuator>{motors}</actuator></mujoco>")
+    with pytest.raises(ValueError, match="'knee' has the actuator .*'knee' of the XML"):
         kit.cfg(xml, articulation=actuated(SERVO)).build()
+
+
+def test_an_actuator_with_the_name_of_one_on_another_joint_is_refused(kit):
+    motor = BuiltinMotorActuatorCfg(target_names_expr=("hip",), effort_limit=1.0)
+    xml = kit.ROBOT.replace("</mujoco>", IN_XML.replace("drive", "hip"))
+    with pytest.raises(ValueError, match=r"joints \['hip'\].*on other targets"):
+        kit.cfg(xml, articulation=actuated(motor)).build()
+
+
+def test_every_actuator_of_the_xml_on_a_joint_is_named_in_the_warning(kit):
+    both = '<actuator><motor name="drive" joint="knee"/><motor name="assist" joint="knee"/>'
+    xml = kit.ROBOT.replace("</mujoco>", f"{both}</actuator></mujoco>")
+    with pytest.warns(UserWarning, match="'drive' of the XML and the actuator 'assist' of the XML"):
+        kit.cfg(xml, articulation=actuated(MOTOR)).build()
 
 
 def test_actuators_of_the_xml_and_others_may_share_a_pattern_but_no_joint(kit):

@@ -57,12 +57,12 @@ def _check_second_actuators(entity: Entity, built: list[tuple[Actuator, list[int
     Raises:
         ValueError: two configs act on one target, or the actuators would have the same name.
     """
-    in_xml = {
-        (transmission, element.target): element.name
-        for element in entity.spec.actuators
-        for transmission, kinds in XML_TRANSMISSIONS.items()
-        if element.trntype in kinds
-    }
+    in_xml: dict[tuple[TransmissionType, str], list[str]] = {}
+    for element in entity.spec.actuators:
+        for transmission, kinds in XML_TRANSMISSIONS.items():
+            if element.trntype in kinds:
+                in_xml.setdefault((transmission, element.target), []).append(element.name)
+    names_in_xml = {element.name for element in entity.spec.actuators}
     claimed: dict[tuple[bool, TransmissionType, str], str] = {}
     for actuator, ids in built:
         cfg, kind = actuator.cfg, actuator.transmission_type
@@ -75,16 +75,25 @@ def _check_second_actuators(entity: Entity, built: list[tuple[Actuator, list[int
             n: f"one by {claimed[wraps, kind, n]}" for n in names if (wraps, kind, n) in claimed
         }
         beside = {
-            name: f"the actuator {in_xml[kind, name] or '(unnamed)'!r} of the XML"
+            name: " and ".join(
+                f"the actuator {other or '(unnamed)'!r} of the XML" for other in in_xml[kind, name]
+            )
             for name in names
             if not wraps and (kind, name) in in_xml
         }
-        taken |= {name: by for name, by in beside.items() if in_xml[kind, name] == name}
+        taken |= {name: by for name, by in beside.items() if name in in_xml[kind, name]}
         message = f"{label} acts on {kind.value}s that have an actuator already: "
         if taken:
             raise ValueError(
                 f"{message}{_list_taken(taken)}. Give each one actuator: narrow the patterns, remove "
                 "the actuator from the XML, or use it as it is there, by XmlActuatorCfg alone."
+            )
+        # New actuators are named as what they act on.
+        same = [short_name(name) for name in names if not wraps and name in names_in_xml]
+        if same:
+            raise ValueError(
+                f"{label} adds actuators to the {kind.value}s {same}, and names them so; the XML has "
+                "actuators of these names on other targets. Rename or remove those in the XML."
             )
         if beside:
             warnings.warn(
