@@ -8,6 +8,7 @@ import re
 import sys
 import textwrap
 import tomllib
+import types
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -149,6 +150,18 @@ def test_a_package_that_misses_a_module_of_the_extra_is_told_the_extra(
     registry.list_tasks()
     (record,) = caplog.records
     assert f"{module} comes with the extra mjlab[compat]" in record.getMessage()
+
+
+def test_a_part_that_an_installed_module_lacks_is_no_missing_module(install, caplog, monkeypatch):
+    """As `moviepy.editor`, which moviepy 2 has no more."""
+    package = types.ModuleType("moviepy")
+    package.__path__ = []
+    monkeypatch.setitem(sys.modules, "moviepy", package)
+    install("their-package", {"first": "broken"}, {"broken.py": "import moviepy.editor"})
+    registry.list_tasks()
+    (record,) = caplog.records
+    assert "moviepy.editor" in record.getMessage()
+    assert "mjlab[compat]" not in record.getMessage()
 
 
 def test_a_task_whose_config_misses_such_a_module_is_told_the_extra_too(install, monkeypatch):

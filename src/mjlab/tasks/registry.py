@@ -15,6 +15,7 @@ import importlib
 import inspect
 import logging
 import pkgutil
+import sys
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -283,7 +284,8 @@ def _missing_extra(error: BaseException) -> str:
     while cause is not None:
         if isinstance(cause, ModuleNotFoundError) and cause.name is not None:
             module = cause.name.partition(".")[0]
-            if module in _COMPAT_MODULES:
+            # An installed package may lack the submodule: moviepy 2 has no `moviepy.editor`.
+            if module in _COMPAT_MODULES and sys.modules.get(module) is None:
                 return (
                     f"\n{module} comes with the extra mjlab[compat]: require that in place of "
                     "mjlab, or run `uv sync --extra compat` in the checkout."
