@@ -17,12 +17,19 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
-_UV = (
-    os.environ.get("UV")
-    or shutil.which("uv")
-    or shutil.which("uv", path=Path.home() / ".local" / "bin")
-)
-needs_uv = pytest.mark.skipif(_UV is None, reason="uv, which resolves, is not installed")
+
+
+@pytest.fixture(scope="module")
+def uv() -> str:
+    """Return the path of uv. `uv run` sets the variable UV, so `make test` always has it."""
+    found = (
+        os.environ.get("UV")
+        or shutil.which("uv")
+        or shutil.which("uv", path=Path.home() / ".local" / "bin")
+    )
+    if found is None:
+        pytest.fail("uv is neither in the variable UV, on PATH nor in ~/.local/bin; use make test.")
+    return found
 
 
 def run(*command: str | Path, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
@@ -115,10 +122,9 @@ def site(wheels, tmp_path_factory) -> Path:
     return folder
 
 
-def install(wheels: Path, target: Path, *flags: str) -> subprocess.CompletedProcess[str]:
-    assert _UV is not None
+def install(uv: str, wheels: Path, target: Path, *flags: str) -> subprocess.CompletedProcess[str]:
     return run(
-        _UV, "pip", "install", "--python", sys.executable, "--offline", "--no-index", "--no-config",
+        uv, "pip", "install", "--python", sys.executable, "--offline", "--no-index", "--no-config",
         "--find-links", wheels, "--target", target, *flags, "walker-tasks", cwd=target.parent,
     )  # fmt: skip
 
@@ -127,11 +133,10 @@ def test_the_version_says_which_interface_it_speaks():
     assert re.fullmatch(r"1\.6\.1\d\d", VERSION)
 
 
-@needs_uv
-def test_a_package_of_the_releases_resolves_and_its_task_is_found(wheels, tmp_path):
+def test_a_package_of_the_releases_resolves_and_its_task_is_found(uv, wheels, tmp_path):
     folder = shutil.copytree(wheels, tmp_path / "wheels")
     build_package(tmp_path / "package", folder, "mjlab>=1.4,<2")
-    done = install(folder, tmp_path / "site")
+    done = install(uv, folder, tmp_path / "site")
     assert done.returncode == 0, done.stderr
     installed = {path.name for path in (tmp_path / "site").glob("*.dist-info")}
     assert {f"mjlab-{VERSION}.dist-info", "walker_tasks-0.3.dist-info"} <= installed
@@ -146,20 +151,18 @@ def test_a_package_of_the_releases_resolves_and_its_task_is_found(wheels, tmp_pa
     )
 
 
-@needs_uv
-def test_a_package_pinned_below_is_refused_unless_the_pin_is_overridden(wheels, tmp_path):
+def test_a_package_pinned_below_is_refused_unless_the_pin_is_overridden(uv, wheels, tmp_path):
     folder = shutil.copytree(wheels, tmp_path / "wheels")
     build_package(tmp_path / "package", folder, "mjlab==1.2.0")
-    refused = install(folder, tmp_path / "site")
+    refused = install(uv, folder, tmp_path / "site")
     assert refused.returncode != 0
     assert "mjlab==1.2.0" in refused.stderr
     (tmp_path / "overrides.txt").write_text("mjlab\n")
-    done = install(folder, tmp_path / "site", "--overrides", "overrides.txt")
+    done = install(uv, folder, tmp_path / "site", "--overrides", "overrides.txt")
     assert done.returncode == 0, done.stderr
 
 
-@needs_uv
-def test_a_project_takes_this_mjlab_for_all_its_packages(wheels, tmp_path):
+def test_a_project_takes_this_mjlab_for_all_its_packages(uv, wheels, tmp_path):
     """As docs/other_packages.md says: a source, and an override for pins below 1.6."""
     folder = shutil.copytree(wheels, tmp_path / "wheels")
     build_package(tmp_path / "package", folder, "mjlab==1.2.0")
@@ -187,8 +190,7 @@ def test_a_project_takes_this_mjlab_for_all_its_packages(wheels, tmp_path):
             """
         )
     )
-    assert _UV is not None
-    locked = run(_UV, "lock", "--offline", "--python", sys.executable, cwd=project)
+    locked = run(uv, "lock", "--offline", "--python", sys.executable, cwd=project)
     assert locked.returncode == 0, locked.stderr
     text = (project / "uv.lock").read_text()
     assert f'source = {{ path = "../{wheel.name}" }}' in text
