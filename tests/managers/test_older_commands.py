@@ -30,6 +30,7 @@ class Play(CommandTerm):
     """A motion player as packages write them: a frame a step, and the robot put back at the end."""
 
     last = 4
+    updates_of_all = 0
 
     def __init__(self, cfg, env):
         super().__init__(cfg, env)
@@ -37,6 +38,8 @@ class Play(CommandTerm):
         self.step_count = 0
         self.metrics["updates"] = torch.zeros(self.num_envs)
         self.dts = []
+        self.generator = torch.Generator().manual_seed(0)
+        self.draws = []
 
     @property
     def command(self):
@@ -53,6 +56,8 @@ class Play(CommandTerm):
 class Update(Play):
     def _update_command(self):
         self.step_count += 1
+        self.updates_of_all += 1
+        self.draws.append(torch.rand(1, generator=self.generator).item())
         self.frame += 1.0
         ended = (self.frame[:, 0] > self.last).nonzero().flatten()
         if len(ended) > 0:
@@ -102,9 +107,9 @@ def _forget_warnings():
     compat._warn_once.cache_clear()
 
 
-def make(term, **fields):
+def make(term, num_envs=NUM_ENVS, **fields):
     cfg = load_env_cfg("Mjlab-Cartpole-Balance")
-    cfg.scene.num_envs = NUM_ENVS
+    cfg.scene.num_envs = num_envs
     fields = {"resampling_time_range": (10.0, 10.0), **fields}
     cfg.commands = {"play": PlayCfg(term=term, **fields)}
     env = ManagerBasedRlEnv(cfg, device="cpu")
@@ -112,18 +117,19 @@ def make(term, **fields):
 
 
 def step(env):
-    return env.step(torch.zeros(NUM_ENVS, 1))
+    return env.step(torch.zeros(env.num_envs, 1))
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning")
+@pytest.mark.parametrize("num_envs", [1, NUM_ENVS])
 @pytest.mark.parametrize("term", [Update, Keywords, Compute, Both, FromMixin])
-def test_every_environment_advances_once_a_step_and_once_a_reset(term):
-    env, play = make(term)
+def test_every_environment_advances_once_a_step_and_once_a_reset(term, num_envs):
+    env, play = make(term, num_envs)
     env.reset()
-    assert play.frame.flatten().tolist() == [1.0] * NUM_ENVS
+    assert play.frame.flatten().tolist() == [1.0] * num_envs
     step(env)
-    assert play.frame.flatten().tolist() == [2.0] * NUM_ENVS
-    assert play.metrics["updates"].tolist() == [2.0] * NUM_ENVS
+    assert play.frame.flatten().tolist() == [2.0] * num_envs
+    assert play.metrics["updates"].tolist() == [2.0] * num_envs
     env.close()
 
 
@@ -160,13 +166,46 @@ def test_a_partial_reset_leaves_commands_metrics_and_robots_of_the_others(term):
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning")
-def test_an_older_compute_gets_a_number_and_new_commands_their_full_time():
-    env, play = make(Compute)
+@pytest.mark.parametrize("num_envs", [1, NUM_ENVS])
+def test_an_older_compute_gets_a_number_and_new_commands_their_full_time(num_envs):
+    env, play = make(Compute, num_envs)
     env.reset()
-    env.episode_length_buf[1] = env.max_episode_length
+    env.episode_length_buf[-1] = env.max_episode_length
     step(env)
     assert play.dts == [0.0, env.step_dt]
-    assert play.time_left.tolist() == pytest.approx([10.0 - env.step_dt, 10.0, 10.0 - env.step_dt])
+    expected = [10.0 - env.step_dt] * (num_envs - 1) + [10.0]
+    assert play.time_left.tolist() == pytest.approx(expected)
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+@pytest.mark.parametrize(
+    "env_ids",
+    [[1], slice(1, 2), torch.tensor([False, True, False]), [False, True, False], torch.tensor([1])],
+)
+def test_an_older_update_takes_every_way_to_name_environments(env_ids):
+    env, play = make(Update)
+    env.reset()
+    play._update_command(env_ids)
+    assert play.frame.flatten().tolist() == [1.0, 2.0, 1.0]
+    play._update_command([])
+    assert play.frame.flatten().tolist() == [1.0, 2.0, 1.0]
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+def test_a_partial_reset_keeps_counters_of_the_class_and_lets_generators_go_on():
+    env, play = make(Update)
+    play._update_command([1])
+    assert play.updates_of_all == 0
+    assert "updates_of_all" not in vars(play)
+    state = play.generator.get_state()
+    play._update_command([1])
+    assert not torch.equal(play.generator.get_state(), state)
+    play._update_command()
+    assert play.updates_of_all == 1
+    play._update_command([1])
+    assert play.updates_of_all == 1
     env.close()
 
 
@@ -234,3 +273,30 @@ def test_controls_of_release_1_2_get_the_three_arguments_they_take():
     env.command_manager.create_gui("server", print, on_change=print)
     assert calls == [("play", "server", print)]
     env.close()
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+@pytest.mark.parametrize(
+    ("parameters", "expected"),
+    [
+        ("on_change=None", {"on_change": 1}),
+        ("on_change", {"on_change": 1}),
+        ("callback=None", {"callback": 1}),
+        ("callback=None, request=None", {"callback": 1, "request": 2}),
+        ("request_action=None", {"request_action": 2}),
+        ("*, request_action=None", {"request_action": 2}),
+        ("on_change=None, *, request_action=None", {"on_change": 1, "request_action": 2}),
+        ("on_change=None, request_action=None", {"on_change": 1, "request_action": 2}),
+        ("**further", {"further": {"on_change": 1, "request_action": 2}}),
+    ],
+)
+def test_controls_get_the_arguments_they_take(parameters, expected):
+    namespace: dict = {}
+    exec(
+        f"def create_gui(self, name, server, get_env_idx, {parameters}): return locals()", namespace
+    )
+    term = type("Controls", (Play,), {"create_gui": namespace["create_gui"]})
+    controls = object.__new__(term)
+    given = controls.create_gui("play", "server", print, 1, 2)
+    basic = {"self": controls, "name": "play", "server": "server", "get_env_idx": print}
+    assert given == basic | expected

@@ -10,6 +10,9 @@ Foot terms of 1.1 and 1.2 read the heights of sites above z = 0 instead of a hei
 from __future__ import annotations
 
 import copy
+import functools
+import inspect
+import warnings
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -19,10 +22,11 @@ import torch
 from mjlab.envs.mdp._checks import require_command
 from mjlab.envs.mdp._indexing import columns
 from mjlab.managers.build_checks import checked_when_built
+from mjlab.managers.env_ids import as_ids
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.tasks.velocity.mdp import feet_rewards
 from mjlab.tasks.velocity.mdp._shared import if_commanded
-from mjlab.tasks.velocity.mdp.sensor_checks import site_columns
+from mjlab.tasks.velocity.mdp.sensor_checks import Source, site_columns
 from mjlab.utils.state import capture_state, restore_state
 
 if TYPE_CHECKING:
@@ -46,19 +50,39 @@ def compute(method: Callable[..., Any], term: Any, dt: Any, *args: Any, **kwargs
     back that the call takes from their `time_left`.
     """
     env_ids, args, kwargs = _split_env_ids(args, kwargs)
-    if isinstance(dt, torch.Tensor) and dt.numel() > 1:
-        step_dt = term._env.step_dt
-        term.time_left += step_dt - dt
-        dt = step_dt
+    if isinstance(dt, torch.Tensor):
+        if dt.ndim > 0 and env_ids is None:
+            step_dt = term._env.step_dt
+            term.time_left += step_dt - dt
+            dt = step_dt
+        else:
+            dt = dt.item()
     with _other_envs_kept(term, env_ids):
         return method(term, dt, *args, **kwargs)
 
 
 def create_gui(
-    method: Callable[..., Any], term: Any, name: str, server: Any, get_env_idx: Any, *_: Any
+    method: Callable[..., Any],
+    term: Any,
+    name: str,
+    server: Any,
+    get_env_idx: Any,
+    on_change: Any = None,
+    request_action: Any = None,
 ) -> Any:
-    """Call `create_gui(self, name, server, get_env_idx)` of release 1.2."""
-    return method(term, name, server, get_env_idx)
+    """Call `create_gui(self, name, server, get_env_idx)`, with the further arguments it takes."""
+    args = (term, name, server, get_env_idx)
+    further = {"on_change": on_change, "request_action": request_action}
+    parameters = inspect.signature(method).parameters
+    kinds = [parameter.kind for parameter in parameters.values()]
+    if inspect.Parameter.VAR_KEYWORD in kinds:
+        return method(*args, **further)
+    named = {key: value for key, value in further.items() if key in parameters}
+    if named:
+        return method(*args, **named)
+    # Under other names.
+    positional = kinds.count(inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return method(*(*args, *further.values())[:positional])
 
 
 def _split_env_ids(
@@ -68,7 +92,7 @@ def _split_env_ids(
     if "env_ids" in kwargs:
         kwargs = dict(kwargs)
         return kwargs.pop("env_ids"), args, kwargs
-    if args and (args[0] is None or isinstance(args[0], (torch.Tensor, slice))):
+    if args and (args[0] is None or isinstance(args[0], (torch.Tensor, slice, list))):
         return args[0], args[1:], kwargs
     return None, args, kwargs
 
@@ -78,16 +102,27 @@ def _other_envs_kept(term: Any, env_ids: Any) -> Generator[None]:
     """Put back what the body changes in a term or in the physics outside `env_ids` (None: all).
 
     Tensors with one row per environment keep their new values in rows `env_ids`. All other state,
-    such as step counters and running means, is put back whole: a reset takes no time.
+    such as step counters and running means, is put back whole: a reset takes no time. Generators
+    go on, so that the next draw is another one.
     """
+    if isinstance(env_ids, list):
+        # An empty list alone would become a tensor of floats.
+        env_ids = torch.as_tensor(env_ids or torch.empty(0, dtype=torch.long), device=term.device)
+    if env_ids is not None:
+        env_ids = as_ids(env_ids, term.num_envs, term.device)
     if env_ids is None or len(env_ids) == term.num_envs:
         yield
         return
     data = term._env.sim.data
-    before = capture_state(term)
+    attributes = set(vars(term))
+    before = capture_state(term, generators=False)
     physics = {name: getattr(data, name).clone() for name in _PHYSICS}
     yield
-    restore_state(term, _merge_rows(before, capture_state(term), env_ids, term.num_envs))
+    after = capture_state(term, generators=False)
+    restore_state(term, _merge_rows(before, after, env_ids, term.num_envs))
+    for name in set(vars(term)) - attributes:
+        if _hides_class_state(term, name):
+            delattr(term, name)
     moved = False
     for name, old in physics.items():
         field = getattr(data, name)
@@ -97,6 +132,18 @@ def _other_envs_kept(term: Any, env_ids: Any) -> Generator[None]:
     if moved:
         # The body may have computed derived quantities from the state that was put back.
         term._env.sim.forward()
+
+
+def _hides_class_state(term: Any, name: str) -> bool:
+    """Return whether an attribute of `term` hides one of its class, such as a step counter.
+
+    Tensors with one row per environment stay, as those that the class does not mention.
+    """
+    value = getattr(term, name)
+    if isinstance(value, torch.Tensor) and value.shape[:1] == (term.num_envs,):
+        return False
+    cached = isinstance(getattr(type(term), name, None), functools.cached_property)
+    return hasattr(type(term), name) and not cached
 
 
 def _merge_rows(before: Any, after: Any, env_ids: torch.Tensor, num_envs: int) -> Any:
@@ -160,9 +207,18 @@ class feet_swing_height(feet_rewards.feet_swing_height):
         command_threshold: float,
         asset_cfg: SceneEntityCfg,
     ) -> torch.Tensor:
-        """Take up the heights of this step, and return the cost of its landings."""
+        """Update the peak heights, and return the cost of landings in this step, (N,)."""
         cost = self.landing_cost(env, sensor_name, foot_height(env, asset_cfg), target_height)
         return if_commanded(cost, env, command_name, command_threshold)
+
+    def _check_feet(self, env: ManagerBasedRlEnv, contacts: Source, heights: Source) -> None:
+        try:
+            super()._check_feet(env, contacts, heights)
+        except ValueError as error:
+            if len(contacts[1]) != len(heights[1]):
+                raise
+            # Releases 1.1 and 1.2 accept any order.
+            warnings.warn(str(error), UserWarning, stacklevel=2)
 
     @staticmethod
     def _height_columns(

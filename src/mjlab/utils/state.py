@@ -65,13 +65,17 @@ def plain_scalar(value: Any) -> Any:
     return SKIP
 
 
-def capture_state(obj: Any) -> dict[str, Any]:
+def capture_state(obj: Any, *, generators: bool = True) -> dict[str, Any]:
     """Return a copy of the run-time state of `obj`, whose class is marked `stateful`.
 
     The result holds only tensors, numbers, strings, None, lists and dicts, so it can be saved by
     `torch.save` and loaded with `weights_only=True`.
+
+    Args:
+        obj: The object.
+        generators: Include the state of random generators.
     """
-    return _capture_object(obj, set())
+    return _capture_object(obj, set(), generators)
 
 
 def restore_state(obj: Any, state: dict[str, Any]) -> None:
@@ -125,46 +129,46 @@ def _transient_names(cls: type) -> set[str]:
     return names
 
 
-def _capture_object(obj: Any, seen: set[int]) -> dict[str, Any]:
+def _capture_object(obj: Any, seen: set[int], generators: bool) -> dict[str, Any]:
     seen.add(id(obj))
     transient = _transient_names(type(obj))
     state: dict[str, Any] = {}
     for name, value in vars(obj).items():
         if name in transient:
             continue
-        captured = _capture_value(value, seen)
+        captured = _capture_value(value, seen, generators)
         if captured is not SKIP:
             state[name] = captured
     return state
 
 
-def _capture_value(value: Any, seen: set[int]) -> Any:
+def _capture_value(value: Any, seen: set[int], generators: bool) -> Any:
     if isinstance(value, torch.Tensor):
         return value.detach().clone() if _owns_its_values(value) else SKIP
     if isinstance(value, np.ndarray):
         return torch.from_numpy(value.copy()) if value.dtype.kind in "biuf" else SKIP
     if isinstance(value, torch.Generator):
-        return value.get_state()
+        return value.get_state() if generators else SKIP
     if getattr(type(value), _MARK, False):
         # An object reached twice is saved once: state is a tree.
         if id(value) in seen:
             return SKIP
-        return {_CLASS_KEY: type(value).__name__, **_capture_object(value, seen)}
+        return {_CLASS_KEY: type(value).__name__, **_capture_object(value, seen, generators)}
     # Sequences keep their length, so that items that are not state hold their place.
     if type(value) in _SEQUENCES:
-        items = [_capture_value(item, seen) for item in value]
+        items = [_capture_value(item, seen, generators) for item in value]
         if items and all(item is SKIP for item in items):
             return SKIP
         return [None if item is SKIP else item for item in items]
     if isinstance(value, dict):
-        return _capture_dict(value, seen)
+        return _capture_dict(value, seen, generators)
     return plain_scalar(value)
 
 
-def _capture_dict(value: dict[Any, Any], seen: set[int]) -> Any:
+def _capture_dict(value: dict[Any, Any], seen: set[int], generators: bool) -> Any:
     if not all(type(key) in (str, int) for key in value):
         return SKIP
-    entries = {key: _capture_value(item, seen) for key, item in value.items()}
+    entries = {key: _capture_value(item, seen, generators) for key, item in value.items()}
     kept = {key: item for key, item in entries.items() if item is not SKIP}
     return SKIP if value and not kept else kept
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import pickle
 from types import SimpleNamespace
 from typing import Any
 
@@ -95,6 +96,17 @@ def test_swing_height_has_the_values_of_release_1_1(env, monkeypatch):
     assert term.peak_heights.flatten().tolist() == pytest.approx([0.0, 0.0, 0.3, 0.0, 0.15, 0.0])
 
 
+def test_older_swing_height_can_be_copied():
+    from mjlab.compat import older_terms
+
+    for cls in (mdp.feet_swing_height, older_terms.feet_swing_height):
+        term: Any = object.__new__(cls)
+        term.peak_heights = torch.ones(2, 2)
+        for copied in (copy.copy(term), copy.deepcopy(term), pickle.loads(pickle.dumps(term))):
+            assert type(copied) is cls
+            assert torch.equal(copied.peak_heights, term.peak_heights)
+
+
 def to_sites(cfg: Any) -> None:
     """Spell the foot terms of a velocity task as the templates of 1.1 and 1.2 did."""
     feet = dict(cfg.rewards["foot_clearance"].params)["asset_cfg"]
@@ -165,3 +177,18 @@ def test_a_template_whose_sites_are_not_asked_for_keeps_its_sensor():
     with pytest.raises(KeyError, match="asset_cfg"):
         alone.params["asset_cfg"]
     assert "foot_height_scan" in [sensor.name for sensor in cfg.scene.sensors]
+
+
+def test_sites_in_another_order_than_the_contacts_are_accepted_with_a_warning(make_env):
+    def edit(cfg):
+        to_sites(cfg)
+        names = cfg.rewards["foot_clearance"].params["asset_cfg"].site_names
+        cfg.rewards["foot_swing_height"].params["asset_cfg"] = SceneEntityCfg(
+            "robot", site_names=tuple(reversed(names)), preserve_order=True
+        )
+
+    with pytest.warns(UserWarning, match="the same feet in the same order"):
+        env = make_env(edit=edit)
+    env.reset()
+    _, reward, *_ = env.step(torch.zeros(env.num_envs, 12))
+    assert reward.isfinite().all()

@@ -17,6 +17,7 @@ from mjlab.managers.build_checks import checked_when_built
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.tasks.velocity.mdp._shared import if_commanded, log_metric, masked_mean
 from mjlab.tasks.velocity.mdp.sensor_checks import (
+    Source,
     check_air_time_sensor,
     check_feet_sensor,
     check_landing_sensor,
@@ -157,9 +158,8 @@ class feet_swing_height:
                 "it has to be positive."
             )
         feet = contact_columns(env, contact)
-        check_same_feet(
-            env, (f"The contact sensor {contact!r}", feet), self._height_columns(env, params)
-        )
+        contacts = f"The contact sensor {contact!r}", feet
+        self._check_feet(env, contacts, self._height_columns(env, params))
         self.peak_heights = torch.zeros(env.num_envs, len(feet), device=env.device)
 
     def __call__(
@@ -171,7 +171,7 @@ class feet_swing_height:
         command_name: str,
         command_threshold: float,
     ) -> torch.Tensor:
-        """Take up the heights of this step, and return the cost of its landings."""
+        """Update the peak heights, and return the cost of landings in this step, (N,)."""
         heights = env.scene[height_sensor_name].data.heights
         cost = self.landing_cost(env, sensor_name, heights, target_height)
         return if_commanded(cost, env, command_name, command_threshold)
@@ -179,7 +179,7 @@ class feet_swing_height:
     def landing_cost(
         self, env: ManagerBasedRlEnv, sensor_name: str, heights: torch.Tensor, target_height: float
     ) -> torch.Tensor:
-        """Take up heights (m), (N, feet), and return the cost of landings, (N,)."""
+        """Update the peaks with `heights` (m), (N, feet); return the cost of landings, (N,)."""
         sensor = env.scene[sensor_name]
         peaks = self.peak_heights
         is_swinging = sensor.data.found == 0
@@ -191,6 +191,9 @@ class feet_swing_height:
         cost = torch.where(has_landed, miss, 0.0).sum(dim=1)
         peaks.masked_fill_(has_landed, 0.0)
         return cost
+
+    def _check_feet(self, env: ManagerBasedRlEnv, contacts: Source, heights: Source) -> None:
+        check_same_feet(env, contacts, heights)
 
     @staticmethod
     def _height_columns(

@@ -74,6 +74,9 @@ def check_landing_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> 
 
 # Feet: columns of different sources that are multiplied with each other.
 
+# What a source is called in messages, and name and body of each of its columns.
+Source = tuple[str, list[tuple[str, int]]]
+
 
 def contact_columns(env: ManagerBasedRlEnv, sensor_name: str) -> list[tuple[str, int]]:
     """Return name and body of each column of a contact sensor."""
@@ -103,15 +106,11 @@ def site_columns(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> list[tupl
     return [_element(env, "site", name, asset_cfg.name) for name in names]
 
 
-def check_same_feet(
-    env: ManagerBasedRlEnv,
-    one: tuple[str, list[tuple[str, int]]],
-    other: tuple[str, list[tuple[str, int]]],
-) -> None:
+def check_same_feet(env: ManagerBasedRlEnv, one: Source, other: Source) -> None:
     """Raise `ValueError` unless the columns of two sources belong to the same feet, in order.
 
     Two columns belong together if they are on the same body, or one is on a part of the other's
-    body. Each source is what it is called, and its columns.
+    body.
     """
     (label, columns), (other_label, other_columns) = one, other
     model = env.sim.mj_model
