@@ -187,7 +187,7 @@ class BuiltinDcMotorActuator(DirectActuator[BuiltinDcMotorActuatorCfg]):
         command = super().compute(cmd)
         if self._input() != _INPUT_VELOCITY:
             return command
-        # Read anew each time, because the gain may be randomized.
+        # Read at each call, because the gain may be randomized.
         gainprm = self._model.actuator_gainprm[:, self.global_ctrl_ids]
         resistance, constant, damping = gainprm[..., 0], gainprm[..., 1], gainprm[..., 6]
         total = damping * resistance / constant  # s + K

@@ -117,7 +117,7 @@ class CommandTerm(ManagerTermBase):
         return log
 
     def take_turns_from(self, episode: int) -> None:
-        """Hear that the next reset, of all environments, begins with this episode of an evaluation.
+        """Select the episodes that the next reset, of all environments, starts in an evaluation.
 
         For commands that share something out evenly over episodes, such as motions: environment i
         is about to play episode `episode + i`. Does nothing unless overridden.

@@ -74,7 +74,7 @@ class ContactSensorCfg(SensorCfg):
     primary: ContactMatch
     """Whose contacts are sensed: each element that matches is one primary."""
     secondary: ContactMatch | None = None
-    """What they have to be with: one element, see `secondary_policy`; None for anything."""
+    """Contact partner: one element, see `secondary_policy`. None: anything."""
     fields: tuple[str, ...] = ("found", "force")
     """What to measure, of: found, force, torque, dist, pos, normal, tangent."""
     reduce: Reduction = "maxforce"

@@ -243,7 +243,7 @@ class DifferentialIKAction(ActionTerm):
     def _get_frame_pose(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return position (N, 3) and quaternion (N, 4) of the frame in the world.
 
-        Subclasses override it for a frame of their own; the point moves with the body.
+        Subclasses override it to control a custom frame; the point moves with the body.
         """
         if self.cfg.frame_type == "body":
             return self._frame_pos, self._frame_rotation
