@@ -114,14 +114,16 @@ def _left_as_found(env: RslRlVecEnvWrapper) -> Generator[None]:
         yield
         return
     state = unwrapped.state_dict()
-    yield
     try:
-        unwrapped.load_state_dict(state)
-    except ValueError as error:
-        logger.warning(
-            "The state of the evaluated environments is not restored, so that another evaluation "
-            "in them may differ. %s", error,
-        )  # fmt: skip
+        yield
+    finally:
+        try:
+            unwrapped.load_state_dict(state)
+        except ValueError as error:
+            logger.warning(
+                "The state of the evaluated environments is not restored, so that another "
+                "evaluation in them may differ. %s", error,
+            )  # fmt: skip
 
 
 @contextmanager
