@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 
@@ -71,6 +72,21 @@ def test_returns_are_before_scaling_by_the_step():
     assert evaluate_policy(plain, still).mean_return == 2.5
 
 
+def test_the_state_is_restored_after_an_evaluation_that_fails():
+    env = counting()
+    state = {"episode": 3}
+    env.unwrapped.state_dict = lambda: dict(state)
+    env.unwrapped.load_state_dict = state.update
+
+    def fails(observations):
+        state["episode"] = 5
+        raise RuntimeError("no more actions")
+
+    with pytest.raises(RuntimeError, match="no more actions"):
+        evaluate_policy(env, fails)
+    assert state == {"episode": 3}
+
+
 def test_more_episodes_than_environments_take_rounds_and_fewer_take_part_of_one():
     assert evaluate_policy(counting(), still, 6).returns == (1.0, 3.0, 6.0, 10.0, 1.0, 3.0)
     assert evaluate_policy(counting(), still, 2).returns == (1.0, 3.0)
@@ -82,6 +98,14 @@ def test_episodes_are_cut_off_and_counted_as_unfinished():
     assert result.num_unfinished == 1
     assert "1 of 4 episodes were cut off" in result.notes[0]
     assert result.to_dict()["notes"] == list(result.notes)
+
+
+def test_figures_are_read_back():
+    metrics = {"one": lambda env: torch.ones(4)}
+    result = evaluate_policy(counting(), still, success_is_survival=True, metrics=metrics)
+    again = EvaluationResult.from_dict({"task": "counting", **result.to_dict()})
+    assert again == dataclasses.replace(result, returns=())
+    assert again.judged("failure_rate") == result.judged("failure_rate")
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -72,7 +73,7 @@ class EvaluationResult:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What to bear in mind with these figures, in sentences."""
+        """Remarks to bear in mind with these figures, in sentences."""
         notes = []
         if self.num_unfinished:
             notes.append(
@@ -93,6 +94,17 @@ class EvaluationResult:
         figures = dataclasses.asdict(self)
         del figures["returns"]
         return {**figures, "notes": list(self.notes)}
+
+    @classmethod
+    def from_dict(cls, figures: Mapping[str, Any]) -> EvaluationResult:
+        """Return the result that `to_dict` made `figures` of, without the single returns.
+
+        Further entries of `figures` are left out.
+        """
+        names = {field.name for field in dataclasses.fields(cls)}
+        own: dict[str, Any] = {name: value for name, value in figures.items() if name in names}
+        own["metrics"] = {name: MeanAndInterval(**value) for name, value in own["metrics"].items()}
+        return cls(**own)
 
     def to_json(self) -> str:
         """Return the figures as JSON."""
