@@ -125,7 +125,16 @@ def test_evaluation_prints_figures_for_machines_and_nothing_else(run, trained):
     assert figures["success_rate"] == 0.0
 
 
-@pytest.mark.parametrize(("flags", "num_envs"), [((), 4), (("--env.scene.num-envs", "3"), 3)])
+@pytest.mark.parametrize(
+    ("flags", "num_envs"),
+    [
+        ((), 4),
+        (("--env.scene.num-envs", "3"), 3),
+        # The task's own number, given.
+        (("--env.scene.num-envs", "1"), 1),
+        (("--env.scene.num_envs=1",), 1),
+    ],
+)
 def test_episodes_are_played_in_as_many_environments_as_asked_for(run, flags, num_envs):
     outcome = run("evaluate", TASK, *SHORT, "--agent", "zero", "--json", *flags)
     assert outcome.status == 0, outcome.err

@@ -186,6 +186,11 @@ def parse_flags(config_type: type[C], default: C, flags: list[str], prog: str) -
     )
 
 
+def is_given(flag: str, flags: list[str]) -> bool:
+    """Return whether the command line `flags` sets `flag`, with `-` or `_` between its words."""
+    return any(word.partition("=")[0].replace("_", "-") == flag for word in flags)
+
+
 def _with_explicit_switches(config_type: Any, flags: list[str]) -> list[str]:
     """Read a bare `--video` as `--video True`, for the switches of `config_type` itself."""
     switches = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mjlab.scripts.cli import run_command, task_and_flags, task_usage
+from mjlab.scripts.cli import is_given, run_command, task_and_flags, task_usage
 
 if TYPE_CHECKING:
     from mjlab.scripts.evaluate_run import EvaluateConfig as EvaluateConfig
@@ -33,9 +33,8 @@ def _command(argv: list[str]) -> None:
     from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
     from mjlab.scripts.policy import parse_policy_flags
 
-    run_evaluate(
-        task, parse_policy_flags(EvaluateConfig, flags, task, "evaluate", purpose="evaluate")
-    )
+    cfg = parse_policy_flags(EvaluateConfig, flags, task, "evaluate", purpose="evaluate")
+    run_evaluate(task, cfg, keep_num_envs=is_given("--env.scene.num-envs", flags))
 
 
 def main() -> None:

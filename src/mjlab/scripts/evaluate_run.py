@@ -35,11 +35,13 @@ class EvaluateConfig(PolicyFlags):
     """Print only JSON."""
 
 
-def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
+def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False) -> dict[str, Any]:
     """Score a policy of `task`, print the figures, and return them.
 
     The environments are those of evaluations in training (`EvaluationCfg.prepare_env`): those of the
-    task's training config where it has none, because the time limit is part of the task.
+    task's training config where it has none, because the time limit is part of the task. There is
+    one for each episode, unless `cfg.env` has another number of them than the task, or
+    `keep_num_envs` says that its number was chosen.
     """
     from mjlab.rl.evaluate import evaluate_policy
     from mjlab.rl.success import required_return, success_definition
@@ -54,7 +56,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
         task,
         env_cfg,
         device,
-        _num_envs(task, cfg, env_cfg),
+        _num_envs(task, cfg, env_cfg, keep_num_envs),
         cfg.engine,
         seed=cfg.seed,
         profile=cfg.profile,
@@ -89,11 +91,13 @@ def run_evaluate(task: str, cfg: EvaluateConfig) -> dict[str, Any]:
     return figures
 
 
-def _num_envs(task: str, cfg: EvaluateConfig, env_cfg: ManagerBasedRlEnvCfg) -> int:
+def _num_envs(
+    task: str, cfg: EvaluateConfig, env_cfg: ManagerBasedRlEnvCfg, keep_num_envs: bool
+) -> int:
     """Return the number of environments: the one set by --env.scene.num-envs, else one per episode."""
     usual = policy_env_cfg(task, cfg.profile, purpose="evaluate").scene.num_envs
     chosen = env_cfg.scene.num_envs
-    return cfg.num_episodes if chosen == usual else chosen
+    return chosen if keep_num_envs or chosen != usual else cfg.num_episodes
 
 
 def _table(figures: dict[str, Any]) -> str:
