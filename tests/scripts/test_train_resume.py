@@ -61,6 +61,17 @@ def test_it_has_the_environments_of_the_run_that_it_resumes(first, resume):
     assert "start anew" not in outcome.err
 
 
+@pytest.mark.parametrize("is_known", [True, False])
+def test_a_seed_to_be_drawn_is_the_one_of_the_run_that_is_resumed(first, resume, is_known):
+    if not is_known:
+        (first / "params" / "agent.yaml").unlink()
+    outcome = resume("--agent.seed", "-1")
+    assert outcome.status == 0, outcome.err
+    params = yaml.safe_load((new_run(first) / "params" / "agent.yaml").read_text())
+    says = "7, as before" if is_known else f"{params['seed']}, drawn"
+    assert f"Seed:    {says}" in outcome.out
+
+
 @pytest.mark.parametrize("flag", ["--num-envs", "--env.scene.num-envs"])
 def test_a_number_of_environments_that_is_given_wins(first, resume, flag):
     assert resume(flag, "5").status == 0

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from mjlab.scripts.cli import UserError, tell
 from mjlab.scripts.profiles import profile_of_run
-from mjlab.scripts.run_folder import read_env_params, read_run_info, run_folders
+from mjlab.scripts.run_folder import read_agent_params, read_env_params, read_run_info, run_folders
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.utils.processes import process_rank
 
@@ -99,6 +99,14 @@ def keep_number_of_environments(task: str, cfg: TrainConfig, checkpoint: Path) -
         return
     scene.num_envs = count
     print(f"Resuming with {count} environments, as before; --num-envs gives another number.")
+
+
+def seed_to_resume(checkpoint: Path | None) -> int | None:
+    """Return the seed of the run of `checkpoint`; None if there is none, or nothing says it."""
+    if checkpoint is None:
+        return None
+    seed: Any = read_agent_params(checkpoint.parent).get("seed")
+    return seed if isinstance(seed, int) and seed >= 0 else None
 
 
 def is_finished(cfg: TrainConfig, runner: MjlabOnPolicyRunner, checkpoint: Path) -> bool:

@@ -20,6 +20,7 @@ from mjlab.scripts.resume import (
     is_finished,
     keep_number_of_environments,
     profile_to_resume,
+    seed_to_resume,
 )
 from mjlab.scripts.run_folder import NewRunFolder, SharedRunFolder, write_run_info
 from mjlab.scripts.task_options import options_of, prepare_env_cfg, with_task_options
@@ -128,14 +129,12 @@ def _train(
     task: str, cfg: TrainConfig, device: str, rank: ProcessRank, output: ProcessOutput | None
 ) -> Path:
     from mjlab.rl.distributed import from_first, same_fate
-    from mjlab.utils.random import draw_seed
 
-    if cfg.agent.seed == -1:
-        cfg.agent.seed = from_first(draw_seed)
-        print(f"Seed:    {cfg.agent.seed}, drawn; --agent.seed {cfg.agent.seed} repeats the run")
-    _apply_short_forms(cfg, rank)
     # The checkpoint is looked for before there is a new folder to be found, and by one process.
     checkpoint = from_first(lambda: checkpoint_to_resume(task, cfg))
+    if cfg.agent.seed == -1:
+        cfg.agent.seed = from_first(lambda: _choose_seed(checkpoint))
+    _apply_short_forms(cfg, rank)
     if checkpoint is not None:
         keep_number_of_environments(task, cfg, checkpoint)
     else:
@@ -170,6 +169,19 @@ def _train(
 
 
 run_train = launch_training
+
+
+def _choose_seed(checkpoint: Path | None) -> int:
+    """Return the seed of the resumed run, or one that is drawn, and say which."""
+    from mjlab.utils.random import draw_seed
+
+    seed = seed_to_resume(checkpoint)
+    if seed is not None:
+        print(f"Seed:    {seed}, as before; --agent.seed gives another")
+        return seed
+    seed = draw_seed()
+    print(f"Seed:    {seed}, drawn; --agent.seed {seed} repeats the run")
+    return seed
 
 
 @contextlib.contextmanager
