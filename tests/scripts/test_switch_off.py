@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
 import pytest
 
 from mjlab.envs import mdp
 from mjlab.managers import (
     CurriculumTermCfg,
+    EventTermCfg,
     MetricsTermCfg,
     ObservationGroupCfg,
     RecorderTerm,
@@ -17,6 +21,9 @@ from mjlab.scripts.cli import parse_flags
 from mjlab.scripts.switch_off import switch_terms_off
 from mjlab.scripts.train_run import TrainConfig
 from mjlab.utils.os import to_plain
+
+if TYPE_CHECKING:
+    from pathlib import Path as KnownToCheckers
 
 TASK = "Mjlab-Cartpole-Swingup"
 
@@ -86,6 +93,17 @@ def test_whatever_is_not_a_term_is_left_to_the_parser(config, flags):
     edited, remaining = switch_terms_off(config, flags)
     assert remaining == flags
     assert to_plain(edited) == to_plain(config)
+
+
+@dataclass(kw_only=True)
+class AnnotatedForCheckersCfg(EventTermCfg):
+    source: KnownToCheckers | None = None
+
+
+def test_a_config_annotated_for_type_checkers_alone_is_left_to_the_parser(config):
+    config.env.events["odd"] = AnnotatedForCheckersCfg(func=print, mode="reset")
+    flags = ["--env.events.odd.source", "None"]
+    assert switch_terms_off(config, flags)[1] == flags
 
 
 def test_the_rest_of_the_command_line_still_counts(config):

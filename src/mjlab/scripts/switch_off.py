@@ -95,7 +95,11 @@ def _may_be_none(holder: Any, key: str) -> bool:
     """Return True if field `key` of a config is declared as a config, or a dict of one, or None."""
     if not is_dataclass(holder):
         return False
-    options = get_args(get_type_hints(type(holder)).get(key))
+    try:
+        options = get_args(get_type_hints(type(holder)).get(key))
+    except NameError:
+        # A class annotated with names that only type checkers import says nothing here.
+        return False
     return NoneType in options and any(
         is_dataclass(option) or get_origin(option) is dict for option in options
     )
