@@ -135,7 +135,8 @@ def plot_seeds(
 def mean_and_std(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return iterations, mean and sample standard deviation over `curves`, at every iteration any has.
 
-    The deviation divides by n - 1, as that of few seeds must; one curve has none (0). Between its points a curve is linear; before its first and after its last it is constant.
+    The deviation divides by n - 1, as that of few seeds must; one curve has none (0). Between its
+    points a curve is linear; before its first and after its last it is constant.
     """
     iterations = np.unique(np.concatenate([curve[0] for curve in curves]))
     values = np.stack([np.interp(iterations, *curve) for curve in curves])
