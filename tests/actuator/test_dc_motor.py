@@ -65,6 +65,10 @@ CASES: dict[str, dict[str, Any]] = {
         "thermal": (0.5, 0.02, 0.0, 0.004, 25.0, 20.0),
     },
     "cogging": {"mode": VOLTAGE, "cogging": (0.3, 6.0, 0.4), "effort_limit": 1.0},
+    "position, gear": {
+        "mode": POSITION, "stiffness": 2.0, "damping": 0.5, "voltage_limit": 24.0, "gear": 3.0
+    },
+    "velocity, gear": {"mode": VELOCITY, "stiffness": 5.0, "voltage_limit": 24.0, "gear": 3.0},
 }  # fmt: skip
 
 
@@ -79,8 +83,12 @@ class Motor:
         self.rise = np.zeros(4)  # temperature above ambient, K
 
     def torque(self, target: np.ndarray, pos: np.ndarray, vel: np.ndarray) -> np.ndarray:
-        """Return the torque, and let STEP seconds pass."""
+        """Return the torque of the motor's shaft, and let STEP seconds pass.
+
+        The target is one of the shaft; position and speed are those of the joint.
+        """
         get = self.fields.get
+        pos, vel = get("gear", 1.0) * pos, get("gear", 1.0) * vel
         u = target
         if rate := get("slew_rate"):
             u = self.command = np.clip(u, self.command - rate * STEP, self.command + rate * STEP)

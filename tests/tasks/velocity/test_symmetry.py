@@ -163,10 +163,11 @@ def test_the_mirror_image_is_exact_after_steps_of_fast_turns_in_the_air(task):
         action = mirrored_rows(env, 0.3 * torch.randn(1, len(env.scene["robot"].joint_names)))
         seen = TensorDict(env.step(action)[0], batch_size=[2])
     both, _ = mirror_left_right(env, seen)
-    for name, columns in term_columns(env, "actor"):
-        gap = (both["actor"][2, columns] - seen["actor"][1, columns]).abs().max()
-        # What the masses of the two sides make of it within 0.06 s.
-        assert gap < (0.5 if name == "joint_vel" else 0.05), (name, gap)
+    for group in ("actor", "critic"):
+        for name, columns in term_columns(env, group):
+            gap = (both[group][2, columns] - seen[group][1, columns]).abs().max()
+            # What the masses of the two sides make of it within 0.06 s.
+            assert gap < (0.5 if name == "joint_vel" else 0.05), (group, name, gap)
     env.close()
 
 
