@@ -250,7 +250,17 @@ def test_several_steps_in_one_call_are_single_steps(pair: Pair) -> None:
         for _ in range(3):
             sim.step()
         for field, value in together.items():
-            torch.testing.assert_close(getattr(sim.data, field), value, msg=field)
+            once = getattr(sim.data, field)
+            if sim.device.startswith("cuda"):
+                # Contacts are in no fixed order there, and sums depend on it.
+                scale = 1.0 + value.float().abs().max() if value.numel() else 1.0
+                assert ((once.float() - value.float()).abs() <= PARITY_TOLERANCE * scale).all(), (
+                    field
+                )
+            elif sim is pair.native:
+                assert torch.equal(once, value), field
+            else:
+                torch.testing.assert_close(once, value, msg=field)
 
 
 def randomize_models(pair: Pair) -> Pair:

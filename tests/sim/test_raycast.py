@@ -148,16 +148,18 @@ def test_a_reach_and_an_excluded_body_are_each_rays_own(shapes):
     assert (normals[1, 1:3] == 0).all()
 
 
-def test_both_engines_meet_the_same_on_any_ray():
+@pytest.mark.parametrize("on_cuda", [False, pytest.param(True, marks=pytest.mark.cuda)])
+def test_both_engines_meet_the_same_on_any_ray(on_cuda, cuda_device):
     generator = torch.Generator().manual_seed(0)
     origins = torch.randn(2, 3000, 3, generator=generator)
     origins[..., 0] += 10 * torch.randint(0, 12, (3000,), generator=generator)
     directions = torch.nn.functional.normalize(torch.randn(2, 3000, 3, generator=generator), dim=-1)
     results = []
-    for engine in ENGINES:
+    for engine, device in (("native", "cpu"), ("warp", cuda_device if on_cuda else "cpu")):
         model = mujoco.MjModel.from_xml_string(SHAPES)
-        sim = Simulation(2, SimulationCfg(engine=engine), model=model, device="cpu")
-        results.append(sim.raycast(origins, directions))
+        sim = Simulation(2, SimulationCfg(engine=engine), model=model, device=device)
+        hits = sim.raycast(origins.to(device), directions.to(device))
+        results.append([values.cpu() for values in hits])
     (native, native_normals, _), (warp, warp_normals, _) = results
     apart = (native - warp).abs() > 1e-3
     # A ray along an edge may pass on either side of it.

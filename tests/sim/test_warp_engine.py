@@ -554,7 +554,8 @@ def test_torch_computes_nothing_that_warp_reads_within_the_same_wait() -> None:
 def test_graphs_on_the_gpu_compute_what_the_cpu_does(own_stream: bool, cuda_device: str) -> None:
     model = mujoco.MjModel.from_xml_string(LANDING_BOX)
     engines = [WarpEngine(model, 3, SimulationCfg(), device) for device in ("cpu", cuda_device)]
-    stream = torch.cuda.Stream() if own_stream else torch.cuda.default_stream()
+    make_stream = torch.cuda.Stream if own_stream else torch.cuda.default_stream
+    stream = make_stream(cuda_device)
     with torch.cuda.stream(stream):
         for engine in engines:
             on_the_floor(engine)
