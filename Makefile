@@ -2,7 +2,7 @@
 UV := ./tools/uv
 DEV := $(UV) run --group dev
 
-.PHONY: help train test test-slow check format bench gpu packages docs
+.PHONY: help train test test-slow test-gpu-script check format bench gpu packages docs
 
 help:  ## Show this list.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -15,6 +15,9 @@ test:  ## Run the test suite.
 
 test-slow:  ## Run the tests that take long.
 	$(DEV) pytest -m slow tests
+
+test-gpu-script:  ## Run every part of `make gpu` at tiny sizes, without a GPU.
+	$(DEV) pytest -m slow tests/benchmarks/test_gpu.py
 
 check:  ## Check format, lint, types and import layers.
 	$(DEV) ruff format --check .

@@ -23,7 +23,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -46,18 +46,29 @@ class Part:
 
     seconds: float
     """Time limit."""
+    least: float
+    """Time (s) that parts before it leave for this one."""
     what: str
-    """What it answers."""
+    """Question it answers, for people."""
 
 
 PARTS = {
-    "kernels": Part(200, "compiles Warp's kernels, the tasks side by side; seconds each"),
-    "tests": Part(120, "the tests marked `cuda`: both engines compute the same"),
-    "parity": Part(80, "observations and rewards of both engines from the same states"),
-    "speed": Part(150, "`env.step` over bare `mujoco_warp`; waits for the GPU, memory"),
-    "learning": Part(180, "Go1 flat until it is solved, scored by `evaluate` on fresh seeds"),
-    "cameras": Part(60, "images a second"),
+    "kernels": Part(200, 60, "compiles Warp's kernels, the tasks side by side; seconds each"),
+    "tests": Part(120, 40, "the tests marked `cuda`: both engines compute the same"),
+    "parity": Part(80, 35, "observations and rewards of both engines from the same states"),
+    "speed": Part(150, 60, "`env.step` over bare `mujoco_warp`; waits for the GPU, memory"),
+    "learning": Part(180, 150, "Go1 flat until it is solved, scored by `evaluate` on fresh seeds"),
+    "cameras": Part(60, 40, "images a second"),
 }
+
+
+def time_limit(part: str, later: Iterable[str], left: float) -> float:
+    """Return the seconds of a part, of the `left` ones for it and all `later` parts.
+
+    Later parts keep their `least`. Where that is too much, each gets its share of it.
+    """
+    own, kept = PARTS[part].least, sum(PARTS[name].least for name in later)
+    return min(PARTS[part].seconds, max(left - kept, left * own / (own + kept)))
 
 
 class Record:
@@ -253,8 +264,9 @@ def main(argv: list[str] | None = None) -> int:
     if not re.fullmatch(r"cpu|cuda(:\d+)?", flags.device):
         raise SystemExit(f"--device: expected cpu, cuda or cuda:<index>, got {flags.device!r}")
     parts = list(dict.fromkeys(flags.part or PARTS))
-    # Processes that parts start find mjlab as this one does.
-    paths = [str(ROOT / "src"), *filter(None, [os.environ.get("PYTHONPATH")])]
+    # Processes that parts start find modules as this one does, in whichever folder they run.
+    given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    paths = [str(ROOT / "src"), *(os.path.abspath(path) for path in given if path)]
     os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
     deadline = time.monotonic() + 60 * flags.minutes
 
@@ -266,9 +278,10 @@ def main(argv: list[str] | None = None) -> int:
         passed = [run_part(part, options_of(part)) for part in parts]
         return int(not all(passed))
     records = []
-    for part in parts:
+    for position, part in enumerate(parts):
         options = options_of(part)
-        seconds = min(options.seconds, deadline - time.monotonic() - _MARGIN)
+        left = deadline - time.monotonic() - _MARGIN
+        seconds = min(options.seconds, time_limit(part, parts[position + 1 :], left))
         if seconds < 1:
             record = Record(options.output, part)
             record.write(status="not started: no time was left")

@@ -1,9 +1,10 @@
-"""What a GPU is asked: to finish, how often the host waits for it, and for its memory."""
+"""Questions to a GPU: has it finished, how often did the host wait for it, how much memory is taken."""
 
 from __future__ import annotations
 
 import contextlib
 import gc
+import math
 import warnings
 from collections import Counter
 from collections.abc import Generator
@@ -93,8 +94,12 @@ class Memory:
         wait(self._device)
         torch.cuda.empty_cache()
         free, total = torch.cuda.mem_get_info(self._device)
+        device = wp.get_device(self._device)
         return {
             "device": total - free,
             "torch": torch.cuda.memory_allocated(self._device),
-            "warp": wp.get_mempool_used_mem_current(wp.get_device(self._device)),
+            # Without a memory pool, Warp does not know.
+            "warp": wp.get_mempool_used_mem_current(device)
+            if device.is_mempool_supported
+            else math.nan,
         }

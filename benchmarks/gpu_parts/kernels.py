@@ -1,4 +1,4 @@
-"""Compiles Warp's kernels for all tasks, in processes side by side, so that later parts do not wait.
+"""Warp's kernels for all tasks, compiled in processes side by side, so that later parts do not wait.
 
 Warp keeps what it has compiled in a folder of the user. `python -m gpu_parts.kernels TASK DEVICE NUM`
 compiles those of one task and prints the seconds.
@@ -29,34 +29,48 @@ from gpu_parts.tasks import (
     TRACKING,
     make_env,
 )
-from gpu_parts.tests import missing_for_tests, pytest_command
+from gpu_parts.tests import environment_of_tests, missing_for_tests, pytest_command
+from mjlab.utils.processes import available_cores
 
 _TESTS = "tests marked `cuda`"
-_TASKS = (CARTPOLE, GO1_FLAT, G1_FLAT, LIFT_CUBE, LIFT_CUBE_RGB, TRACKING, GO1_ROUGH, G1_ROUGH)
+# The first has contacts, joint limits and sensors: most modules of `mujoco_warp`.
+_TASKS = (GO1_FLAT, G1_ROUGH, LIFT_CUBE_RGB, TRACKING, G1_FLAT, GO1_ROUGH, LIFT_CUBE, CARTPOLE)
 
 
 def measure(options: Options) -> Iterator[Row]:
     """Compile; a row for each process, as it ends.
+
+    The first task is alone: it compiles what all have in common, which the others find.
 
     Raises:
         RuntimeError: some of the processes failed; the others have ended then.
     """
     failed: list[str] = []
     begin = time.monotonic()
+    waiting = _commands(options)
     with contextlib.ExitStack() as stack:
         running: dict[str, tuple[subprocess.Popen[str], IO[str]]] = {}
-        for name, command in _commands(options).items():
-            # Into a file: the output of processes that wait for a reader would stop them.
-            log = stack.enter_context(tempfile.TemporaryFile("w+"))
-            process = subprocess.Popen(
-                command, cwd=Path(__file__).parents[1], stdout=log, stderr=log, text=True
-            )
-            stack.callback(process.wait)
-            stack.callback(process.kill)
-            running[name] = (process, log)
-        while running:
+        has_compiled = False
+        while waiting or running:
+            most = max(1, available_cores() // 2) if has_compiled else 1
+            while waiting and len(running) < most:
+                name = next(iter(waiting))
+                # Into a file: the output of processes that wait for a reader would stop them.
+                log = stack.enter_context(tempfile.TemporaryFile("w+"))
+                process = subprocess.Popen(
+                    waiting.pop(name),
+                    cwd=Path(__file__).parents[1],
+                    env=environment_of_tests(options),
+                    stdout=log,
+                    stderr=log,
+                    text=True,
+                )
+                stack.callback(process.wait)
+                stack.callback(process.kill)
+                running[name] = (process, log)
             ended = [name for name, (process, _) in running.items() if process.poll() is not None]
             for name in ended:
+                has_compiled = True
                 process, log = running.pop(name)
                 log.seek(0)
                 said = log.read()

@@ -7,6 +7,7 @@ seeds that no evaluation of the training used.
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import subprocess
 import sys
@@ -14,13 +15,13 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import torch
 from report import Row
 
 from gpu_parts.options import Options
 from gpu_parts.tasks import GO1_FLAT
+from mjlab.rl.evaluation_result import EvaluationResult
 from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
 from mjlab.scripts.policy import parse_policy_flags
 from mjlab.tasks.registry import load_rl_cfg
@@ -39,13 +40,13 @@ def measure(options: Options) -> Iterator[Row]:
         content = torch.load(checkpoint, map_location="cpu", weights_only=True)
         iterations = int(content["iterations_finished"])
         scores = {"warp": _score(checkpoint, "warp", options.device, options)}
-        solved = _is_solved(scores["warp"])
+        solved = _is_solved(scores["warp"]) and not was_cut
         ended = f"cut off after {seconds:.0f} s" if was_cut else f"{seconds:.0f} s"
         yield Row(
             f"{GO1_FLAT}, `--profile {_PROFILE}`, Warp: time from `train` until it stops because it "
             "is solved",
             f"{ended}, {iterations} iterations; {_shown(scores['warp'])}",
-            f"scored by `evaluate` on {scores['warp']['num_episodes']} episodes of fresh seeds",
+            f"scored by `evaluate` on {scores['warp'].num_episodes} episodes of fresh seeds",
             ", ".join(f"{name} below {most:g}" for name, most in _conditions().items()),
             solved if not options.tiny else None,
         )
@@ -63,7 +64,7 @@ def _train(log_root: Path, options: Options) -> tuple[float, bool]:
     """Train until the task is solved or the time is over; return the seconds, and whether cut off."""
     command = [sys.executable, "-m", "mjlab.scripts.train", GO1_FLAT, "--profile", _PROFILE]
     command += ["--device", options.device, "--engine", "warp", "--log-root", str(log_root)]
-    command += ["--agent.seed", str(_TRAINING_SEED)]
+    command += ["--agent.seed", str(_TRAINING_SEED), "--agent.save-interval", "20"]
     if options.tiny:
         command += ["--num-envs", "2", "--agent.max-iterations", "1"]
     begin = time.monotonic()
@@ -76,7 +77,9 @@ def _train(log_root: Path, options: Options) -> tuple[float, bool]:
             # It then saves what it has learned.
             was_cut = True
             process.send_signal(signal.SIGINT)
-            process.wait(30)
+            # If that takes too long, the newest of its regular checkpoints is scored.
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(min(30.0, 0.25 * options.seconds))
     finally:
         process.kill()
         process.wait()
@@ -92,31 +95,26 @@ def _newest_checkpoint(log_root: Path) -> Path:
     return checkpoints[-1]
 
 
-def _score(checkpoint: Path, engine: str, device: str, options: Options) -> dict[str, Any]:
-    """Return the figures of `evaluate`."""
+def _score(checkpoint: Path, engine: str, device: str, options: Options) -> EvaluationResult:
+    """Return what `evaluate` finds."""
     episodes = options.sized({"warp": 1000, "native": 256}, {"warp": 2, "native": 2})[engine]
     flags = ["--checkpoint-file", str(checkpoint), "--profile", _PROFILE, "--engine", engine]
     flags += ["--device", device, "--seed", str(_FRESH_SEED), "--num-episodes", str(episodes)]
     if options.tiny:
         flags += ["--max-steps", "3"]
     cfg = parse_policy_flags(EvaluateConfig, flags, GO1_FLAT, "evaluate", purpose="evaluate")
-    return run_evaluate(GO1_FLAT, cfg)
+    return EvaluationResult.from_dict(run_evaluate(GO1_FLAT, cfg))
 
 
 def _conditions() -> dict[str, float]:
     return dict(load_rl_cfg(GO1_FLAT, profile=_PROFILE).evaluation.solved_below)
 
 
-def _is_solved(result: dict[str, Any]) -> bool:
-    # Written so that NaN meets nothing.
-    return all(_figure(result, name) <= most for name, most in _conditions().items())
+def _is_solved(result: EvaluationResult) -> bool:
+    # Judged as in training. Written so that NaN meets nothing.
+    return all(result.judged(name) <= most for name, most in _conditions().items())
 
 
-def _figure(result: dict[str, Any], name: str) -> float:
-    metric = result["metrics"].get(name)
-    return float(result[name] if metric is None else metric["mean"])
-
-
-def _shown(result: dict[str, Any]) -> str:
-    errors = ", ".join(f"{name} {_figure(result, name):.3f}" for name in _conditions())
-    return f"{errors}; return {result['mean_return']:.0f}"
+def _shown(result: EvaluationResult) -> str:
+    errors = ", ".join(f"{name} {result.figure(name):.3f}" for name in _conditions())
+    return f"{errors}; return {result.mean_return:.0f}"

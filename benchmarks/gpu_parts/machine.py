@@ -1,9 +1,8 @@
-"""What the figures depend on: the machine, its GPU and the versions of the libraries."""
+"""Machine, GPU and versions of libraries that the figures depend on."""
 
 from __future__ import annotations
 
 import contextlib
-import os
 import platform
 import subprocess
 import time
@@ -14,15 +13,15 @@ import mujoco_warp
 import torch
 import warp
 
+from mjlab.utils.processes import available_cores
+
 
 def described(device: str) -> dict[str, Any]:
     """Return what the figures depend on."""
     found: dict[str, Any] = {
         "date": time.strftime("%Y-%m-%d %H:%M"),
         "device": device,
-        "cores": len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count(),
+        "cores": available_cores(),
         "python": platform.python_version(),
         "torch": torch.__version__,
         "warp": warp.__version__,

@@ -1,4 +1,4 @@
-"""What a part is told."""
+"""Options of a part."""
 
 from __future__ import annotations
 

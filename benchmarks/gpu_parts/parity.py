@@ -80,7 +80,7 @@ class _Errors:
 def measure(options: Options) -> Iterator[Row]:
     """Compare one task of each family; two rows a task."""
     num_envs, steps = options.sized((128, 40), (4, 2))
-    for task in options.sized((CARTPOLE, GO1_FLAT, LIFT_CUBE, TRACKING), (CARTPOLE,)):
+    for task in options.sized((CARTPOLE, GO1_FLAT, LIFT_CUBE, TRACKING), (CARTPOLE, GO1_FLAT)):
         native, warp = both(task, num_envs, options.device)
         yield from compare(task, native, warp, steps)
         for env in (native, warp):

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import mujoco
 import mujoco_warp
 import torch
 import warp
@@ -44,16 +43,18 @@ class BareWarp:
 
     def __init__(self, env: ManagerBasedRlEnv) -> None:
         self._env, sim = env, env.sim
+        engine: Any = sim._engine
         self._device = wp.get_device(env.device)
         with wp.ScopedDevice(self._device):
             self._model = mjw.put_model(sim.mj_model)
-            sim.cfg.apply_wp_opt(self._model.opt)
+            # All as the engine does it.
             self._model.opt.warn_overflow = 0
-            start = mujoco.MjData(sim.mj_model)
-            mujoco.mj_forward(sim.mj_model, start)
+            if self._device.is_cuda:
+                self._model.opt.graph_conditional = wp.is_conditional_graph_supported()
+            sim.cfg.apply_wp_opt(self._model.opt)
             self._data = mjw.put_data(
                 sim.mj_model,
-                start,
+                engine._placed(sim.mj_model, sim.cfg),
                 env.num_envs,
                 nconmax=sim.wp_data.naconmax // env.num_envs,
                 njmax=sim.wp_data.njmax,
@@ -65,6 +66,11 @@ class BareWarp:
                 owner = self._model if hasattr(self._model, name) else self._model.opt
                 own = TorchArray(getattr(owner, name)).tensor
                 own.copy_(getattr(sim.model, name).view(own.shape))
+            if engine.is_expanded("stat.meaninertia"):
+                expand_model_fields(self._model, env.num_envs, ["stat.meaninertia"])
+                wait(env.device)
+                inertia = TorchArray(self._model.stat.meaninertia).tensor
+                inertia.copy_(engine.model_field("stat.meaninertia"))
             self._rays = [_Rays(env, *call) for call in _recorded_rays(env)]
             wait(env.device)
             # Kernels are loaded by the first call. On a GPU the next ones replay a graph.
@@ -173,13 +179,15 @@ def _recorded_rays(env: ManagerBasedRlEnv) -> list[tuple[Any, ...]]:
 
 def measure(options: Options) -> Iterator[Row]:
     """Measure every task; three rows each."""
-    tasks = options.sized((CARTPOLE, GO1_FLAT, G1_FLAT, GO1_ROUGH, G1_ROUGH), (CARTPOLE,))
+    tasks = options.sized((CARTPOLE, GO1_FLAT, G1_FLAT, GO1_ROUGH, G1_ROUGH), (CARTPOLE, GO1_ROUGH))
+    # Contexts of libraries on the GPU are no memory of environments.
+    close(stepped_env(options.sized(GO1_FLAT, CARTPOLE), 2, options.device, 1)[0])
     for task in tasks:
         yield from _measure_task(task, options)
 
 
 def _measure_task(task: str, options: Options) -> Iterator[Row]:
-    device, num_envs = options.device, options.sized(4096, 4)
+    device, num_envs = options.device, options.sized(4096, 2)
     memory = Memory(device)
     env, actions = stepped_env(task, num_envs, device, options.sized(_STEPS_BEFORE, 2))
     taken = memory.shown()

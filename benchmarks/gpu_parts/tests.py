@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import os
 import subprocess
 import sys
@@ -46,7 +46,14 @@ def measure(options: Options) -> Iterator[Row]:
 
 def missing_for_tests() -> list[str]:
     """Return the packages that the tests need and that are not installed."""
-    return [name for name in _NEEDED if importlib.util.find_spec(name) is None]
+    missing = []
+    for name in _NEEDED:
+        # Imported, because one of those that it needs itself may be missing.
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            missing.append(error.name or name)
+    return missing
 
 
 def pytest_command(options: Options) -> list[str]:
@@ -57,11 +64,16 @@ def pytest_command(options: Options) -> list[str]:
     return [*command, "-k", _TINY] if options.tiny else command
 
 
+def environment_of_tests(options: Options) -> dict[str, str]:
+    """Return the environment variables of the tests: the device of those marked `cuda`."""
+    return {**os.environ, "MJLAB_TEST_CUDA_DEVICE": options.device}
+
+
 def _run_pytest(report: Path, options: Options) -> tuple[int, str]:
     process = subprocess.Popen(
         [*pytest_command(options), f"--junitxml={report}"],
         cwd=_ROOT,
-        env={**os.environ, "MJLAB_TEST_CUDA_DEVICE": options.device},
+        env=environment_of_tests(options),
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import shutil
@@ -44,12 +45,20 @@ ENDS = {
 }
 
 
-def run(folder: Path, *flags: str, timeout: float = 300.0) -> subprocess.CompletedProcess[str]:
-    # As on a machine where mjlab is not installed: `-P` and no path of this project.
+def run(
+    folder: Path,
+    *flags: str,
+    timeout: float = 300.0,
+    cwd: str | Path = "/",
+    python_path: str | None = None,
+) -> subprocess.CompletedProcess[str]:
+    # As on a machine where mjlab is not installed: no path of this project, unless one is given.
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    if python_path is not None:
+        environment["PYTHONPATH"] = python_path
     command = [sys.executable, str(folder / "gpu.py"), *flags]
     return subprocess.run(
-        command, capture_output=True, text=True, env=environment, timeout=timeout, cwd="/"
+        command, capture_output=True, text=True, env=environment, timeout=timeout, cwd=cwd
     )
 
 
@@ -57,6 +66,7 @@ def content(output: Path, part: str) -> dict[str, Any]:
     return json.loads((output / f"{part}.json").read_text())
 
 
+@pytest.mark.slow
 def test_every_part_runs_on_the_cpu(tmp_path: Path) -> None:
     done = run(BENCHMARKS, "--device", "cpu", "--tiny", "--in-process", "--output", str(tmp_path))
     assert done.returncode == 0, done.stdout + done.stderr
@@ -72,6 +82,14 @@ def test_every_part_runs_on_the_cpu(tmp_path: Path) -> None:
     assert tests["reached"]
     assert not tests["measured"].startswith("0 passed")
     assert all(row["reached"] for row in content(tmp_path, "parity")["rows"])
+    compared = " ".join(row["what"] for row in content(tmp_path, "parity")["rows"])
+    assert "Cartpole" in compared
+    assert "Flat-Unitree-Go1" in compared
+    timed = " ".join(row["what"] for row in content(tmp_path, "speed")["rows"])
+    assert "Cartpole" in timed
+    assert "Rough-Unitree-Go1" in timed
+    # With rays of the bare loop, as many as the scan of the terrain has.
+    assert "the same" in timed
 
 
 @pytest.fixture
@@ -89,15 +107,14 @@ def stubs(tmp_path: Path) -> Path:
 
 def test_parts_that_fail_keep_their_rows_and_let_the_others_go_on(stubs: Path, tmp_path: Path):
     output = tmp_path / "results"
-    done = run(stubs, "--minutes", "0.15", "--output", str(output))
+    done = run(stubs, "--minutes", "0.5", "--seconds", "4", "--output", str(output))
     assert done.returncode == 1
     found = {part: content(output, part) for part in PARTS}
     statuses = {part: record["status"] for part, record in found.items()}
     assert statuses == {
         **dict.fromkeys(("kernels", "tests"), "done"),
-        **dict.fromkeys(("parity", "speed"), "failed"),
+        **dict.fromkeys(("parity", "speed", "cameras"), "failed"),
         "learning": "out of time",
-        "cameras": "not started: no time was left",
     }
     for part in PARTS[:-1]:
         assert found[part]["rows"][0]["what"] == "first"
@@ -109,6 +126,102 @@ def test_parts_that_fail_keep_their_rows_and_let_the_others_go_on(stubs: Path, t
     everything = (output / "table.md").read_text()
     assert all(f"## {part}: {status}" in everything for part, status in statuses.items())
     assert "Not passed: tests, parity, speed, learning, cameras." in done.stdout
+
+
+def test_a_part_without_time_is_not_started(stubs: Path, tmp_path: Path) -> None:
+    flags = ("--part", "kernels", "--minutes", "0.09", "--output", str(tmp_path / "results"))
+    assert run(stubs, *flags).returncode == 1
+    status = content(tmp_path / "results", "kernels")["status"]
+    assert status == "not started: no time was left"
+
+
+def test_processes_of_parts_find_modules_of_a_relative_path(stubs: Path, tmp_path: Path) -> None:
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site/only_there.py").write_text("")
+    part = """
+    code = subprocess.run([sys.executable, "-c", "import only_there"], cwd="/").returncode
+    yield Row("found in another folder", str(code), "", "", code == 0)"""
+    (stubs / "gpu_parts/kernels.py").write_text(STUB.format(rest=part))
+    flags = ("--part", "kernels", "--output", str(tmp_path / "results"))
+    done = run(stubs, *flags, cwd=tmp_path, python_path=f"site{os.pathsep}")
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The script as a module."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return importlib.import_module("gpu")
+
+
+def test_parts_that_take_all_they_may_leave_the_later_ones_enough(gpu: Any) -> None:
+    total = left = 60 * gpu.MINUTES - 5
+    limits = {}
+    for position, part in enumerate(PARTS):
+        limits[part] = gpu.time_limit(part, PARTS[position + 1 :], left)
+        left -= limits[part]
+    assert sum(limits.values()) == pytest.approx(total)
+    for part, limit in limits.items():
+        assert gpu.PARTS[part].least <= limit <= gpu.PARTS[part].seconds, part
+    assert limits["kernels"] > 150
+
+
+def test_too_little_time_is_shared_by_all_parts(gpu: Any) -> None:
+    left, limits = 100.0, []
+    for position, part in enumerate(PARTS):
+        limits.append(gpu.time_limit(part, PARTS[position + 1 :], left) / gpu.PARTS[part].least)
+        left -= gpu.time_limit(part, PARTS[position + 1 :], left)
+    assert limits == pytest.approx([limits[0]] * len(PARTS))
+    assert gpu.time_limit("cameras", [], 1000.0) == gpu.PARTS["cameras"].seconds
+
+
+def test_what_a_package_of_the_tests_lacks_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    from gpu_parts import tests
+
+    assert tests.missing_for_tests() == []
+    monkeypatch.setitem(sys.modules, "sortedcontainers", None)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "hypothesis"]:
+        monkeypatch.delitem(sys.modules, name)
+    assert tests.missing_for_tests() == ["sortedcontainers"]
+
+
+def test_the_first_task_compiles_alone_and_few_others_at_a_time(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    from gpu_parts import kernels
+    from gpu_parts.options import Options
+
+    task = "import time; a = time.time(); time.sleep(0.3); print(a, time.time())"
+    commands = {str(k): [sys.executable, "-c", task] for k in range(5)}
+    monkeypatch.setattr(kernels, "_commands", lambda options: commands)
+    monkeypatch.setattr(kernels, "available_cores", lambda: 5)
+    rows = list(kernels.measure(Options("cpu", True, tmp_path, 60.0)))
+    assert [row.what[0] for row in rows][0] == "0"
+    assert sorted(row.what[0] for row in rows) == ["0", "1", "2", "3", "4"]
+    times = sorted(tuple(map(float, row.compared_with.split())) for row in rows)
+    for begin, _ in times:
+        assert sum(start <= begin < end for start, end in times) <= 2
+    assert all(begin >= times[0][1] for begin, _ in times[1:])
+
+
+def test_training_that_does_not_end_when_told_to_is_scored_by_its_checkpoint(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    from gpu_parts import learning
+    from gpu_parts.options import Options
+
+    deaf = "import signal, time; signal.signal(signal.SIGINT, signal.SIG_IGN); time.sleep(60)"
+    start = subprocess.Popen
+    monkeypatch.setattr(
+        learning.subprocess, "Popen", lambda command: start([sys.executable, "-c", deaf])
+    )
+    begin = time.monotonic()
+    assert learning._train(tmp_path, Options("cpu", True, tmp_path, 2.0))[1], "it was not cut off"
+    assert time.monotonic() - begin < 20
 
 
 @pytest.mark.parametrize(("part", "status"), [("kernels", 0), ("tests", 1), ("cameras", 1)])
