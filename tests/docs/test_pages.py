@@ -30,6 +30,7 @@ _MAKE = re.compile(r"\bmake ([a-z-]+)")
 _ELSEWHERE = {"help", "seeds", "keyword", "output", "tag", "title", "group"}
 _INSTALLERS = {"extra", "overrides", "no-deps", "no-index", "only-binary", "find-links", "target"}
 _INSTALLERS |= {"dest", "python-version", "implementation", "platform"}
+_INSTALLERS |= {"python-platform", "no-header", "no-annotate"}
 _TORCHRUN = {"nnodes", "node-rank", "nproc-per-node", "rdzv-backend", "rdzv-endpoint", "rdzv-id"}
 
 

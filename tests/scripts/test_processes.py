@@ -114,9 +114,9 @@ def test_both_resume_from_the_checkpoint_that_the_first_finds_before_there_is_a_
     (run_dir,) = set(resumed.runs()) - {before}
     assert [path.name for path in checkpoints_in(run_dir)] == ["model_2.pt"]
     assert not (run_dir / "torchrunx").exists()
-    # The first process draws the seed of all.
+    # The first process tells all the seed of the run that is resumed.
     seed = resumed.probe(0)["seed"]
-    assert f"--agent.seed {seed} repeats the run" in ended[0].out
+    assert f"{seed}, as before" in ended[0].out
     assert resumed.probe(1)["seed"] == process_seed(seed, 1)
     assert resumed.probe(1)["iterations"] == 3
     assert resumed.probe(0)["total_steps"] == 3 * 4 * 4 * 2

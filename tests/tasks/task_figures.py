@@ -8,6 +8,7 @@ default of its field. `play_differs` lists, by path, where the config to play wi
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import enum
 import math
 from collections.abc import Mapping
@@ -60,10 +61,14 @@ def figures_of(value: Any) -> Any:
 
 def _figures_of_dataclass(value: Any) -> dict[str, Any]:
     result: dict[str, Any] = {"_": type(value).__name__}
+    parameters = inspect.signature(type(value)).parameters
     for field in dataclasses.fields(value):
         current = getattr(value, field.name)
         figures = figures_of(current)
-        if not _is_default(field, figures) and not field.name.startswith("_"):
+        # Some required fields have a default that only packages of earlier releases rely on.
+        required = field.init and parameters[field.name].default is inspect.Parameter.empty
+        is_default = not required and _is_default(field, figures)
+        if not is_default and not field.name.startswith("_"):
             result[field.name] = figures
     return result
 
