@@ -8,8 +8,8 @@ default of its field. `play_differs` lists, by path, where the config to play wi
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import enum
+import inspect
 import math
 from collections.abc import Mapping
 from pathlib import Path
