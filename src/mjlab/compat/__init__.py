@@ -306,10 +306,9 @@ def older_names(module_name: str) -> Callable[[str], Any]:
     def __getattr__(name: str) -> Any:
         if name not in table:
             raise AttributeError(f"module {module_name!r} has no attribute {name!r}")
-        home, _, today = table[name].partition(":")
-        value = getattr(importlib.import_module(home), today)
-        message = f"{module_name}.{name} is an older name; today it is {home}.{today}."
-        if home == _OLDER:
+        value = _load(table[name])
+        message = f"{module_name}.{name} is an older name; today it is {_dotted(table[name])}."
+        if table[name].startswith(f"{_OLDER}:"):
             message = f"{module_name}.{name} is an older name, and is removed in mjlab 2.0."
         if inspect.isfunction(value):
             return _warning_when_called(value, module_name, name, message)
@@ -328,7 +327,7 @@ def older_exports(module_name: str) -> list[str]:
     return [name for name in _NAMES[module_name] if name[0].islower()]
 
 
-def accepts_older_methods(cls: C) -> C:
+def offers_older_static_methods(cls: C) -> C:
     """Class decorator: offer the static methods that were dropped from a class."""
     for name, path in _STATIC_METHODS[cls.__name__].items():
         setattr(cls, name, staticmethod(_calling(f"{cls.__name__}.{name}", path)))
@@ -336,11 +335,9 @@ def accepts_older_methods(cls: C) -> C:
 
 
 def _calling(older_name: str, path: str) -> Callable[..., Any]:
-    home, _, today = path.partition(":")
-
     def older(*args: Any, **kwargs: Any) -> Any:
-        _warn_once(f"{older_name} is an older name; today it is {home}.{today}.")
-        return getattr(importlib.import_module(home), today)(*args, **kwargs)
+        _warn_once(f"{older_name} is an older name; today it is {_dotted(path)}.")
+        return _load(path)(*args, **kwargs)
 
     return older
 
@@ -365,14 +362,14 @@ class _OlderAttribute:
     """Attribute of an instance, computed by a function of `mjlab.compat.older`."""
 
     def __init__(self, class_name: str, name: str, function: str) -> None:
-        self._function = function
+        self._path = f"{_OLDER}:{function}"
         self._message = f"{class_name}.{name} is an older attribute, and is removed in mjlab 2.0."
 
     def __get__(self, instance: Any, owner: type) -> Any:
         if instance is None:
             return self
         _warn_once(self._message)
-        return getattr(importlib.import_module(_OLDER), self._function)(instance)
+        return _load(self._path)(instance)
 
 
 def offers_older_attributes(cls: C) -> C:
@@ -549,8 +546,13 @@ def offers_older_sites(make_cfg: T) -> T:
 
 
 def _load(path: str) -> Any:
+    """Import and return the object at "module:name"."""
     home, _, name = path.partition(":")
     return getattr(importlib.import_module(home), name)
+
+
+def _dotted(path: str) -> str:
+    return path.replace(":", ".")
 
 
 def set_array_field(field: Any, values: Any) -> None:

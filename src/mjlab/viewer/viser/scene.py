@@ -12,7 +12,7 @@ import numpy as np
 import viser
 from mjviser import ViserMujocoScene
 
-from mjlab.compat import accepts_older_methods
+from mjlab.compat import offers_older_static_methods
 from mjlab.viewer.camera import CameraView, first_moving_body, whole_model_view
 from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS as VIEWER_MODEL_FIELDS
 from mjlab.viewer.model_sync import copy_state, host_model, sync_model_fields, to_numpy
@@ -24,7 +24,7 @@ _DEFAULT_FOV = 60.0
 _CONTACT_WIDENING = 4.2
 
 
-@accepts_older_methods
+@offers_older_static_methods
 class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
     """mjviser's scene of all environments, a debug visualizer, and a camera.
 
