@@ -29,7 +29,7 @@ class Solved:
     seconds: float
     """Time from the command until training was told to stop."""
     score: dict[str, Any]
-    """What `evaluate --json True` printed of the last checkpoint."""
+    """Output of `evaluate --json True` for the last checkpoint."""
 
 
 def train(task: str, flags: list[str], seed: int, log_root: str, episodes: int) -> Solved | None:

@@ -32,7 +32,7 @@ class Waits:
     """Operations of torch that made the host wait for the GPU."""
 
     places: Counter[str] = field(default_factory=Counter)
-    """How often, by `file:line`."""
+    """Number of host synchronizations by `file:line`."""
     is_known: bool = True
     """False on the CPU, where torch does not tell."""
 

@@ -1,4 +1,4 @@
-"""What a run writes, beside rsl_rl's own logger, and what subclasses of the runner read of it."""
+"""Run logger: tags and values against rsl_rl's logger, and attributes that runner subclasses read."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ class PretendCuda(TorchFunctionMode):
     def __init__(self) -> None:
         super().__init__()
         self.waits: Counter[str] = Counter()
-        """How often the host waited, by `file:line function` of the innermost line of mjlab."""
+        """Number of host synchronizations by `file:line function` of the innermost line of mjlab."""
         self._is_paused = False
 
     @contextlib.contextmanager

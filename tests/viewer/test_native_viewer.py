@@ -81,7 +81,7 @@ def test_key_codes_are_those_of_glfw() -> None:
 
 
 class TestDebugDrawing:
-    """What subclasses change: `_update_debug_visualizers` and `_show_debug_vis`."""
+    """Overridable hooks: `_update_debug_visualizers` and `_show_debug_vis`."""
 
     @pytest.fixture(autouse=True)
     def _setup(self) -> None:

@@ -77,7 +77,7 @@ class DelayedActuator(Actuator, metaclass=_HasDelay):
 
 @dataclass
 class FieldSpec:
-    """How a field was described to `randomize_field`; kept for packages that build one."""
+    """Description of a model field for `randomize_field`; unused, for packages that build one."""
 
     entity_type: Literal["dof", "joint", "body", "geom", "site", "actuator"]
     use_address: bool = False

@@ -52,7 +52,7 @@ class CommandTerm(ManagerTermBase):
         command_counter: Number of commands in this episode, (num_envs,) int64.
         metrics: Name to values (num_envs,); their means are logged at resets, then zeroed.
 
-    Raises `ValueError` if the config's time range is negative or turned round.
+    Raises `ValueError` if the config's time range is negative or has min > max.
     """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:

@@ -104,8 +104,8 @@ class EvaluationCfg:
     """What evaluations measure beside the return: `func(env) -> (num_envs,)` by name, averaged over
     the steps of an episode."""
     stop_when_solved: bool = True
-    """Whether training stops there, once an evaluation of episodes that were not used before
-    confirms it."""
+    """Stop training once the task is solved and a second evaluation, of unused episodes, confirms
+    it."""
     num_episodes: int = 256
     """Episodes of an evaluation, and of the one that confirms it; each environment plays one, with
     the deterministic policy."""

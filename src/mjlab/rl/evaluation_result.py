@@ -149,7 +149,7 @@ class Episodes:
     lengths: torch.Tensor
     """Steps, (E,) int64."""
     finished: torch.Tensor
-    """Whether the episode ended by itself, or lasted as long as episodes of the task do, (E,) bool."""
+    """True if the episode terminated or reached the task's episode length, (E,) bool."""
     failed: torch.Tensor
     """Whether a termination ended it before its time was over, (E,) bool."""
     succeeded: torch.Tensor
