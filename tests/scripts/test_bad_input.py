@@ -360,7 +360,7 @@ def test_a_full_disk_keeps_the_previous_checkpoint(run, tmp_path, monkeypatch):
 def test_an_engine_whose_package_is_missing_is_refused_with_the_other(
     attempt, monkeypatch, missing
 ):
-    monkeypatch.delitem(sys.modules, "mjlab.sim.engines.warp", raising=False)
+    monkeypatch.delitem(sys.modules, "mjlab.sim.warp.engine", raising=False)
     monkeypatch.setitem(sys.modules, missing, None)
     message = attempt("--engine", "warp")
     assert missing in message

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mjlab.sim import Simulation, SimulationCfg
-from mjlab.sim.engines import native_render
+from mjlab.sim.native import render as native_render
 from mjlab.sim.rendering import CameraView
 
 SHAPES = ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")

@@ -14,8 +14,8 @@ from torch.overrides import TorchFunctionMode
 
 from mjlab.sim.config import MujocoCfg, SimulationCfg
 from mjlab.sim.engine import EngineUnavailableError
-from mjlab.sim.engines.warp import WarpEngine
-from mjlab.sim.engines.warp_support import rotation_matrices
+from mjlab.sim.warp.engine import WarpEngine
+from mjlab.sim.warp.support import rotation_matrices
 from mjlab.sim.randomization import expand_model_fields
 from mjlab.sim.sim_data import TorchArray, WarpBridge
 
@@ -473,7 +473,7 @@ def test_warp_is_quiet_unless_asked_otherwise(
 ) -> None:
     import warp as wp
 
-    from mjlab.sim.engines.warp import _be_quiet
+    from mjlab.sim.warp.engine import _be_quiet
 
     monkeypatch.setattr(wp.config, "log_level", wp.LOG_INFO)
     if wish is None:

@@ -9,8 +9,8 @@ import mujoco
 import pytest
 
 from mjlab.sim.config import SimulationCfg
-from mjlab.sim.engines.warp import WarpEngine
-from mjlab.sim.engines.warp_overflow import SIZES
+from mjlab.sim.warp.engine import WarpEngine
+from mjlab.sim.warp.overflow import SIZES
 
 # Twelve contacts in each environment, four a box.
 BOXES = """

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from mjlab.entity.indexing import element_id
-from mjlab.sim.engines.field_lists import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
+from mjlab.sim.field_lists import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
 from mjlab.sim.variants import VariantColumns
 from mjlab.utils.mujoco import dof_width, qpos_width
 

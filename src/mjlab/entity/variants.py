@@ -29,7 +29,7 @@ from mjlab.entity._variant_slots import SlotKey as SlotKey
 from mjlab.entity._variant_slots import VariantSlot as VariantSlot
 from mjlab.entity._variant_values import KINDS, VariantTable
 from mjlab.entity.entity import Entity, EntityCfg
-from mjlab.sim.engines.field_lists import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
+from mjlab.sim.field_lists import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
 from mjlab.sim.variants import VARIANT_DEPENDENT_FIELDS as VARIANT_DEPENDENT_FIELDS
 from mjlab.sim.variants import VariantColumns, VariantInfo, VariantValues
 
@@ -311,7 +311,7 @@ def build_variant_model(
     Raises:
         ValueError: the spec does not compile, with MuJoCo's message.
     """
-    from mjlab.sim.engines.warp import put_variant_model
+    from mjlab.sim.warp.engine import put_variant_model
     from mjlab.sim.simulation import compile_spec
 
     model = compile_spec(spec)

@@ -151,6 +151,6 @@ class SimulationCfg:
             )
         wp_opt.contact_sensor_maxmatch = self.contact_sensor_maxmatch
         if self.broadphase is not None or self.broadphase_filter is not None:
-            from mjlab.sim.engines.warp import set_broadphase
+            from mjlab.sim.warp.engine import set_broadphase
 
             set_broadphase(wp_opt, self.broadphase, self.broadphase_filter)

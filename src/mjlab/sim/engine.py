@@ -1,9 +1,9 @@
 """The seam between mjlab and a physics engine.
 
 Everything above this file sees batched torch tensors; everything below it is one engine's own
-business. `sim/engines/native.py` and `sim/engines/warp.py` are the only two implementations and the
-only two files that import `mjbatch`, `warp` or `mujoco_warp`. `create_engine` imports them lazily,
-so a CPU run never loads Warp and `import mjlab.envs` works with either package missing.
+business. `sim/native/` and `sim/warp/` are the only two implementations and the only two folders
+that import `mujoco.batch`, `warp` or `mujoco_warp`. `create_engine` imports them lazily, so a CPU
+run never loads Warp and `import mjlab.envs` works where Warp is missing.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     import mujoco
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
     from mjlab.sim.rendering import CameraView, Images
 
+
+Stage = Literal["pos", "vel", "acc"]
+"""How far a forward pass goes: positions; positions and velocities; everything."""
 
 # Fields that MuJoCo stores as nine numbers in a row and that cross the seam as 3 x 3 matrices.
 ROTATION_MATRICES = frozenset({"xmat", "ximat", "geom_xmat", "site_xmat", "cam_xmat", "cam_mat0"})
@@ -125,8 +128,12 @@ class Engine(ABC):
         """Advance all environments by `nstep` physics steps."""
 
     @abstractmethod
-    def forward(self, env_ids: torch.Tensor | None) -> None:
-        """Make derived fields current with the state, without advancing time."""
+    def forward(self, env_ids: torch.Tensor | None, stage: Stage = "acc") -> None:
+        """Make derived fields up to a stage current with the state, without advancing time.
+
+        `"pos"`: positions and contacts. `"vel"`: velocities too. `"acc"`: everything. Fields and
+        sensors of later stages keep their values.
+        """
 
     @abstractmethod
     def reset(self, env_ids: torch.Tensor | None) -> None:
@@ -211,8 +218,8 @@ class Engine(ABC):
 
 
 _ENGINES = {
-    "native": ("mjlab.sim.engines.native", "NativeEngine"),
-    "warp": ("mjlab.sim.engines.warp", "WarpEngine"),
+    "native": ("mjlab.sim.native.engine", "NativeEngine"),
+    "warp": ("mjlab.sim.warp.engine", "WarpEngine"),
 }
 
 

@@ -17,6 +17,6 @@ def expand_model_fields(model: Any, nworld: int, fields_to_expand: list[str]) ->
     Raises:
         ValueError: no such field, or one that MuJoCo Warp cannot hold per world.
     """
-    from mjlab.sim.engines.warp import expand_arrays
+    from mjlab.sim.warp.engine import expand_arrays
 
     expand_arrays(getattr(model, "struct", model), nworld, list(fields_to_expand))

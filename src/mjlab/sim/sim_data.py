@@ -22,7 +22,7 @@ class TorchArray:
     """
 
     def __init__(self, wp_array: Any, nworld: int | None = None) -> None:
-        from mjlab.sim.engines.warp import as_torch
+        from mjlab.sim.warp.engine import as_torch
 
         tensor = as_torch(wp_array)
         self._wp_array = wp_array

@@ -16,10 +16,11 @@ from mjlab.sim.config import SimulationCfg
 from mjlab.sim.engine import (
     Capabilities,
     EngineUnavailableError,
+    Stage,
     create_engine,
     resolve_engine_name,
 )
-from mjlab.sim.engines.field_lists import COLLISION_MASKS
+from mjlab.sim.field_lists import COLLISION_MASKS
 from mjlab.sim.fields import FieldView, SharedField
 from mjlab.sim.variants import VariantInfo, VariantValues
 from mjlab.utils.nan_guard import NanGuard
@@ -284,9 +285,13 @@ class Simulation:
             with self.nan_guard.watch(self._data):
                 self._engine.step(1)
 
-    def forward(self, env_ids: EnvIds = None) -> None:
-        """Make derived fields current with the state, without advancing time."""
-        self._engine.forward(self.resolve_ids(env_ids))
+    def forward(self, env_ids: EnvIds = None, stage: Stage = "acc") -> None:
+        """Make derived fields up to a stage current with the state, without advancing time.
+
+        `"pos"`: positions and contacts. `"vel"`: velocities too. `"acc"`: everything. Fields and
+        sensors of later stages keep their values.
+        """
+        self._engine.forward(self.resolve_ids(env_ids), stage)
         for callback in self._forward_callbacks:
             callback()
 

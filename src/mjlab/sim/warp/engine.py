@@ -26,20 +26,21 @@ from mjlab.sim.engine import (
     Capabilities,
     Engine,
     EngineUnavailableError,
+    Stage,
 )
-from mjlab.sim.engines.field_lists import (
+from mjlab.sim.field_lists import (
     COLLISION_MASKS,
     CONSTANTS_AT_QPOS0,
     FIXED_CONSTANTS,
     INPUTS,
     ZERO_INPUTS,
 )
-from mjlab.sim.engines.sensor_fed import refuse_without_sensor
-from mjlab.sim.engines.warp_fields import find_data_field, find_model_field
-from mjlab.sim.engines.warp_overflow import OverflowWatch, contacts_per_environment
-from mjlab.sim.engines.warp_rays import WarpRays
-from mjlab.sim.engines.warp_render import WarpRenderer
-from mjlab.sim.engines.warp_support import (
+from mjlab.sim.sensor_fed import refuse_without_sensor
+from mjlab.sim.warp.fields import find_data_field, find_model_field
+from mjlab.sim.warp.overflow import OverflowWatch, contacts_per_environment
+from mjlab.sim.warp.rays import WarpRays
+from mjlab.sim.warp.render import WarpRenderer
+from mjlab.sim.warp.support import (
     UnsupportedByWarpError,
     mocap_bodies,
     raycast_problem,
@@ -360,7 +361,7 @@ class WarpEngine(Engine):
             mjwarp.fwd_kinematics(self.wp_model, self.wp_data)
             mjwarp.com_vel(self.wp_model, self.wp_data)
 
-    def forward(self, env_ids: torch.Tensor | None) -> None:
+    def forward(self, env_ids: torch.Tensor | None, stage: Stage = "acc") -> None:
         # Warp computes all environments; those not asked for get their values back, so that
         # derived fields of theirs that are one substep old stay so, as on the native engine.
         results = [

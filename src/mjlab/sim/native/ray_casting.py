@@ -1,4 +1,4 @@
-"""One query of `mjbatch`, repeated for the rays that hit what they have to pass."""
+"""One query of `Batch.ray`, repeated for the rays that hit what they have to pass."""
 
 from __future__ import annotations
 
@@ -68,16 +68,16 @@ def cast_through(
         hits: Where the results go.
         passed: Which hits do not count; None if all do.
         rows: Sorted ids of simulations.
-        options: Further arguments of `Batch.rays`.
+        options: Further arguments of `Batch.ray`.
     """
     gone: Array | None = None
     for attempt in range(_MAX_PASSES + 1):
-        batch.rays(
-            origins, directions, hits.distances, hits.geoms, hits.normals, ids=rows, **options
+        some = slice(None) if rows is None else rows
+        hits.distances[some], hits.geoms[some], hits.normals[some] = batch.ray(
+            origins[some], directions[some], ids=rows, normal=True, **options
         )
         if passed is None:
             return
-        some = slice(None) if rows is None else rows
         found = hits[some]
         repeat = passed(some, origins[some], directions[some], found)
         chosen = repeat.any(axis=1)

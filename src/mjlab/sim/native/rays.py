@@ -2,7 +2,7 @@
 
 `mj_ray` tries every geom of the model for every ray, and on generated terrain these are hundreds.
 So rays are cast against the geoms that never move in further batches, whose simulations hold only
-the few geoms that are near (`native_ray_nearby`). Their numbers are the same, hence the results.
+the few geoms that are near (`ray_nearby`). Their numbers are the same, hence the results.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import mujoco
 import numpy as np
 import torch
 
-from mjlab.sim.engines.native_ray_casting import Hits, cast_through
-from mjlab.sim.engines.native_ray_culling import CullingRule
-from mjlab.sim.engines.native_ray_nearby import NearbyRays, cluster_rays
-from mjlab.sim.engines.native_ray_planes import StaticPlanes
-from mjlab.sim.engines.native_ray_sharing import SharedGeoms
-from mjlab.sim.engines.native_ray_tiles import (
+from mjlab.sim.native.ray_casting import Hits, cast_through
+from mjlab.sim.native.ray_culling import CullingRule
+from mjlab.sim.native.ray_nearby import NearbyRays, cluster_rays
+from mjlab.sim.native.ray_planes import StaticPlanes
+from mjlab.sim.native.ray_sharing import SharedGeoms
+from mjlab.sim.native.ray_tiles import (
     StaticGeoms,
     in_groups,
     is_static,
@@ -186,7 +186,7 @@ class NativeRays:
             passed if plan.is_one_sided else None,
             envs,
             geomgroup=plan.mask,
-            bodyexclude=plan.excluded,
+            bodyexclude=-1 if plan.excluded is None else plan.excluded,
             flg_static=static,
         )
 

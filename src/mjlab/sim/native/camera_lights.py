@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import mujoco
 import torch
 
-from mjlab.sim.engines.native_camera_geoms import CameraPose, ReadField
-from mjlab.sim.engines.native_camera_pixels import PixelRays
+from mjlab.sim.native.camera_geoms import CameraPose, ReadField
+from mjlab.sim.native.camera_pixels import PixelRays
 
 _SPOT = int(mujoco.mjtLightType.mjLIGHT_SPOT)
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)

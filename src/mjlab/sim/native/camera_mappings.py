@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import torch
 
-from mjlab.sim.engines.native_camera_geoms import (
+from mjlab.sim.native.camera_geoms import (
     BOX,
     CAPSULE,
     CYLINDER,

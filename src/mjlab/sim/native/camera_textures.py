@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import torch
 
-from mjlab.sim.engines.native_camera_geoms import (
+from mjlab.sim.native.camera_geoms import (
     MESH,
     PLANE,
     CameraPose,
@@ -21,10 +21,10 @@ from mjlab.sim.engines.native_camera_geoms import (
     PosedGeoms,
     ReadField,
 )
-from mjlab.sim.engines.native_camera_mappings import MAPPINGS, sky_coordinates
+from mjlab.sim.native.camera_mappings import MAPPINGS, sky_coordinates
 
 if TYPE_CHECKING:
-    from mjlab.sim.engines.native_camera_colours import MetSurfaces
+    from mjlab.sim.native.camera_colours import MetSurfaces
 
 _RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 _SKYBOX = int(mujoco.mjtTexture.mjTEXTURE_SKYBOX)

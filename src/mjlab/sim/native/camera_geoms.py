@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import torch
 
-from mjlab.sim.engines.native_camera_pixels import PixelGrid, PixelRays
+from mjlab.sim.native.camera_pixels import PixelGrid, PixelRays
 from mjlab.sim.rendering import rendered_geoms
 from mjlab.utils.lab_api.math import matrix_from_quat, quat_conjugate, quat_from_matrix, quat_mul
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import mujoco
 import torch
 
-from mjlab.sim.engines.native_camera_geoms import CameraPose, GeomTable, PosedGeoms, ReadField
-from mjlab.sim.engines.native_camera_lights import Lighting, LightTable, Shadow
-from mjlab.sim.engines.native_camera_pixels import PixelRays
-from mjlab.sim.engines.native_camera_textures import TextureTable, of_materials
+from mjlab.sim.native.camera_geoms import CameraPose, GeomTable, PosedGeoms, ReadField
+from mjlab.sim.native.camera_lights import Lighting, LightTable, Shadow
+from mjlab.sim.native.camera_pixels import PixelRays
+from mjlab.sim.native.camera_textures import TextureTable, of_materials
 
 # What a geom without a material reflects, and the exponent of a shininess of 1.
 _SPECULAR, _SHININESS = 0.5, 0.5

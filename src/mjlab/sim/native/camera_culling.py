@@ -9,11 +9,11 @@ import mujoco
 import numpy as np
 import torch
 
-from mjlab.sim.engines.native_camera_geoms import HFIELD, MESH, GeomTable, PosedGeoms
-from mjlab.sim.engines.native_camera_pixels import Lens
-from mjlab.sim.engines.native_camera_slots import SlotBatch
-from mjlab.sim.engines.native_ray_casting import Hits, Passed
-from mjlab.sim.engines.native_ray_culling import CullingRule
+from mjlab.sim.native.camera_geoms import HFIELD, MESH, GeomTable, PosedGeoms
+from mjlab.sim.native.camera_pixels import Lens
+from mjlab.sim.native.camera_slots import SlotBatch
+from mjlab.sim.native.ray_casting import Hits, Passed
+from mjlab.sim.native.ray_culling import CullingRule
 
 Array = np.ndarray
 

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 import torch
 
-from mjlab.sim.engines.native_camera_geoms import HFIELD, MESH, SPHERE, GeomTable, PosedGeoms
-from mjlab.sim.engines.native_ray_casting import Hits, Passed, cast_through
-from mjlab.sim.engines.native_ray_tiles import slot_model
+from mjlab.sim.native.camera_geoms import HFIELD, MESH, SPHERE, GeomTable, PosedGeoms
+from mjlab.sim.native.ray_casting import Hits, Passed, cast_through
+from mjlab.sim.native.ray_tiles import slot_model
 
 # More slots than are needed now, so that they are still enough when the camera has turned.
 _HEADROOM = 1.3
@@ -89,7 +89,7 @@ class SlotBatch:
     ) -> None:
         """Write values (n, G, ...) of geoms, or (1, G, ...), into slots."""
         chosen = values.flatten(0, 1)[column if len(values) == 1 else flat]
-        self._values[name].flatten(0, 1)[place] = chosen
+        self._values[name].flatten(0, 1)[place] = chosen.to(self._values[name].dtype)
 
     def _require(self, slots: int) -> None:
         """Have at least so many slots."""
@@ -99,7 +99,7 @@ class SlotBatch:
         kinds = [*self._kinds, *[SPHERE] * (width - len(self._kinds))]
         self._batch = self._make_batch(slot_model(self._model, kinds), self._rows)
         for name in _FIELDS:
-            self._values[name] = torch.from_numpy(self._batch.expand(name, np.float32))
+            self._values[name] = torch.from_numpy(self._batch.expand(name))
         for name in _NUMBERS:
             self._values[name] = torch.from_numpy(self._batch.expand(name))
         self._values["geom_group"].fill_(_EMPTY)
@@ -118,13 +118,8 @@ class SlotBatch:
             return
         chosen = None if rows == self._rows else np.arange(rows)
         if passed is None and not normals:
-            self._batch.rays(
-                self.origins,
-                self.directions,
-                self.hits.distances,
-                self.hits.geoms,
-                geomgroup=self._mask,
-                ids=chosen,
+            self.hits.distances[:rows], self.hits.geoms[:rows] = self._batch.ray(
+                self.origins[:rows], self.directions[:rows], geomgroup=self._mask, ids=chosen
             )
             return
         cast_through(

@@ -16,6 +16,16 @@ ZERO_INPUTS = (
 # All that somebody writes before a step, or that a step itself carries on.
 INPUTS = (*ZERO_INPUTS, "qpos", "eq_active", "mocap_pos", "mocap_quat")
 
+# Results that MuJoCo's reset clears too.
+RESULTS_ZERO_ON_RESET = frozenset({"qacc", "act_dot", "sensordata"})
+
+# Derived fields that a forward pass computes in its last stage, beside columns of `sensordata`.
+ACCELERATION_FIELDS = frozenset(
+    {"qacc", "qacc_smooth", "qfrc_smooth", "qfrc_constraint", "qfrc_actuator", "qfrc_inverse"}
+    | {"actuator_force", "act_dot", "cacc", "cfrc_int", "cfrc_ext"}
+    | {"solver", "solver_niter", "solver_nnz", "solver_fwdinv"}
+)
+
 # Which geoms may touch each other.
 COLLISION_MASKS = ("geom_contype", "geom_conaffinity")
 

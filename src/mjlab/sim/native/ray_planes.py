@@ -5,8 +5,8 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from mjlab.sim.engines.native_ray_casting import Hits
-from mjlab.sim.engines.native_ray_tiles import is_static
+from mjlab.sim.native.ray_casting import Hits
+from mjlab.sim.native.ray_tiles import is_static
 
 Array = np.ndarray
 

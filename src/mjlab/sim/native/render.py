@@ -16,18 +16,18 @@ import mujoco
 import numpy as np
 import torch
 
-from mjlab.sim.engines.native_camera_colours import MetSurfaces, Shading
-from mjlab.sim.engines.native_camera_culling import SurfaceCulling
-from mjlab.sim.engines.native_camera_geoms import (
+from mjlab.sim.native.camera_colours import MetSurfaces, Shading
+from mjlab.sim.native.camera_culling import SurfaceCulling
+from mjlab.sim.native.camera_geoms import (
     RENDERED_KINDS,
     CameraPose,
     GeomTable,
     PosedGeoms,
     ReadField,
 )
-from mjlab.sim.engines.native_camera_lights import Shadow
-from mjlab.sim.engines.native_camera_pixels import Lens, PixelGrid, PixelRays
-from mjlab.sim.engines.native_camera_slots import SlotBatch
+from mjlab.sim.native.camera_lights import Shadow
+from mjlab.sim.native.camera_pixels import Lens, PixelGrid, PixelRays
+from mjlab.sim.native.camera_slots import SlotBatch
 from mjlab.sim.rendering import BACKGROUND, LENS_FIELDS, CameraView, Images, far_limit
 
 # So many rays are cast and shaded at a time: what they need stays in the caches of the CPU.

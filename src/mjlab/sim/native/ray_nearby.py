@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from mjlab.sim.engines.native_ray_casting import Hits, cast_through
-from mjlab.sim.engines.native_ray_culling import CullingRule
-from mjlab.sim.engines.native_ray_tiles import StaticGeoms, TileTable, slot_model
+from mjlab.sim.native.ray_casting import Hits, cast_through
+from mjlab.sim.native.ray_culling import CullingRule
+from mjlab.sim.native.ray_tiles import StaticGeoms, TileTable, slot_model
 
 Array = np.ndarray
 

@@ -1,0 +1,565 @@
+"""MuJoCo's batch engine (`mujoco.batch`) on CPU threads.
+
+A simulation is its double-precision state row inside `mujoco.batch.Batch`. What crosses the seam are
+float32 copies of the fields that were asked for. Before a call, elements that were written since the
+last one are copied into the rows; the others never round them. After a call, the fields that it
+computed are copied out. A field costs time only once it is read.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+import logging
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import DATA_FIELDS, MODEL_FIELDS, Batch, SimulationError
+
+from mjlab.sim.engine import (
+    ROTATION_MATRICES,
+    Capabilities,
+    Engine,
+    EngineUnavailableError,
+    Stage,
+)
+from mjlab.sim.field_lists import (
+    ACCELERATION_FIELDS,
+    COLLISION_MASKS,
+    CONSTANTS_AT_QPOS0,
+    FIXED_CONSTANTS,
+    INPUTS,
+    RESULTS_ZERO_ON_RESET,
+)
+from mjlab.sim.native.midphase import FIELDS as MIDPHASE_FIELDS
+from mjlab.sim.native.midphase import MidphaseMargins
+from mjlab.sim.native.rays import NativeRays
+from mjlab.sim.native.render import NativeRenderer, render_problem
+from mjlab.sim.sensor_fed import refuse_without_sensor
+from mjlab.utils.processes import cores_per_process
+
+if TYPE_CHECKING:
+    from mjlab.sim.config import SimulationCfg
+    from mjlab.sim.rendering import CameraView, Images
+
+logger = logging.getLogger(__name__)
+
+# State that a step changes by itself; the rest changes only by being written.
+_ADVANCED = frozenset({"time", "qpos", "qvel", "act", "qacc_warmstart"})
+
+_DERIVED_CONSTANTS = (*FIXED_CONSTANTS, *CONSTANTS_AT_QPOS0, "dof_M0")
+
+# The compiler marks frames that coincide and MuJoCo then skips their transforms, so the marks
+# have to go before such a frame is randomized.
+_FRAME_MARKS = {
+    "body_ipos": ("body_sameframe", "geom_sameframe", "site_sameframe"),
+    "body_iquat": ("body_sameframe", "geom_sameframe", "site_sameframe"),
+    "geom_pos": ("geom_sameframe",),
+    "geom_quat": ("geom_sameframe",),
+    "site_pos": ("site_sameframe",),
+    "site_quat": ("site_sameframe",),
+}
+_INERTIAL_FRAME = ("body_ipos", "body_iquat")
+
+# Whole numbers in a model are addresses, kinds and masks, from which array sizes and the pairs that
+# may collide were compiled; changed in one environment they would act in part or not at all. These
+# are the ones that MuJoCo looks up each time and that nothing was compiled from.
+_FREE_INTEGERS = frozenset(
+    {"geom_matid", "geom_dataid", "geom_condim", "geom_priority", "mat_texid", "mat_texuniform"}
+    | {"site_matid", "tendon_matid", "light_active", "light_castshadow", "light_type"}
+    | {"jnt_limited", "tendon_limited", "jnt_actfrclimited", "tendon_actfrclimited"}
+    | {"actuator_ctrllimited", "actuator_forcelimited", "actuator_actlimited"}
+)
+_DERIVED_BY_ENGINE = frozenset({"body_margin"})
+
+_STAGES = {
+    "pos": int(mujoco.mjtStage.mjSTAGE_POS),
+    "vel": int(mujoco.mjtStage.mjSTAGE_VEL),
+    "acc": int(mujoco.mjtStage.mjSTAGE_ACC),
+}
+
+# Steps for which the state before the last substep is kept; see `NativeEngine._fill`.
+_FIRST_STEPS = 100
+
+
+class NativeEngine(Engine):
+    """MuJoCo's own C code, one thread pool for all environments, bit-reproducible."""
+
+    def __init__(
+        self, model: mujoco.MjModel, num_envs: int, cfg: SimulationCfg, device: str
+    ) -> None:
+        if cfg.num_threads < 0:
+            raise ValueError(
+                f"SimulationCfg.num_threads is {cfg.num_threads}; give 0 for all cores, or more."
+            )
+        self.num_envs = num_envs
+        self._model = copy.copy(model)
+        # MuJoCo would put a diverged environment back to qpos0 by itself and hide the NaN from
+        # the guard and from the environment, which count it and reset that environment.
+        self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        # `Batch` would take every core of the machine by itself.
+        threads = cfg.num_threads or min(cores_per_process(), num_envs)
+        sleeps = self._model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        try:
+            self._batch = Batch(self._model, num_envs, threads, persistent=bool(sleeps))
+        except (ValueError, RuntimeError) as error:
+            raise EngineUnavailableError(
+                f"The native engine refuses this model: {error}. Use --engine warp."
+            ) from error
+        self._rows = torch.from_numpy(self._batch.state)
+        self._warm_start = _state_slice(self._model, mujoco.mjtState.mjSTATE_WARMSTART)
+        self._inputs: dict[str, _Copy] = {}
+        self._outputs: dict[str, _Copy] = {}
+        self._tensors: dict[str, torch.Tensor] = {}
+        self._model_copies: dict[str, _Copy] = {}
+        self._model_tensors: dict[str, torch.Tensor] = {}
+        self._sensor_columns = _columns_before_acceleration(self._model)
+        self._frame_marks: dict[str, np.ndarray] = {}
+        self._midphase: MidphaseMargins | None = None
+        self._before: torch.Tensor | None = None
+        self._first_steps = _FIRST_STEPS
+        self._has_warned = False
+        self._rays: NativeRays | None = None
+        self._renderer: NativeRenderer | None = None
+        threads = self._batch.nthread
+        self.capabilities = Capabilities(
+            name="native",
+            device="cpu",
+            description=(
+                f"native (MuJoCo {mujoco.__version__}), device cpu, "
+                f"{threads} physics thread{'s' if threads != 1 else ''}"
+            ),
+            num_threads=threads,
+            render_problem=render_problem(self._model),
+        )
+
+    # Fields.
+
+    def data_field(self, name: str) -> torch.Tensor:
+        if name not in self._tensors:
+            if name not in DATA_FIELDS:
+                raise AttributeError(f"The native engine: {_reason(self._batch.bind, name)}.")
+            refuse_without_sensor(self._model, name)
+            source = _as_tensor(self._batch.bind(name))
+            dtype = torch.bool if name == "eq_active" else _seam_type(source)
+            field = _Copy(source, dtype)
+            if name in INPUTS:
+                self._inputs[name] = field
+            else:
+                self._fill(field)
+                self._outputs[name] = field
+            self._tensors[name] = _like_mujoco(name, field.values)
+        return self._tensors[name]
+
+    def _fill(self, field: _Copy) -> None:
+        """Compute a field that was just bound, which reads zero until the next call.
+
+        Between a step and the next `forward`, derived fields are one substep old. Terms read most
+        fields for the first time in the middle of the first step. So the state before the last
+        substep is kept until the first `forward` after a step, and that substep is taken once more.
+        Nothing but the field changes.
+        """
+        self._copy_in()
+        if self._before is not None:
+            after = self._rows.clone()
+            self._rows.copy_(self._before)
+            self._call(self._batch.step)
+            self._rows.copy_(after)
+        else:
+            warm_start = self._rows[:, self._warm_start].clone()
+            self._call(self._batch.forward)
+            self._rows[:, self._warm_start] = warm_start
+        field.copy_out()
+
+    def model_field(self, name: str) -> torch.Tensor:
+        if name not in self._model_tensors:
+            raise ValueError(f"MjModel field {name!r} has not been expanded.")
+        return self._model_tensors[name]
+
+    def is_expanded(self, field: str) -> bool:
+        return field in self._model_tensors
+
+    def expand(self, fields: tuple[str, ...]) -> None:
+        for name in fields:
+            if name in self._model_tensors:
+                continue
+            self._check_expandable(name)
+            for mark in _FRAME_MARKS.get(name, ()):
+                if mark not in self._frame_marks:
+                    self._frame_marks[mark] = self._batch.expand(mark)
+                    self._frame_marks[mark][:] = 0
+            values = _as_tensor(self._batch.expand(self._model_name(name)))
+            if _seam_type(values) != values.dtype:
+                self._model_copies[name] = _Copy(values, _seam_type(values))
+                values = self._model_copies[name].values
+            self._model_tensors[name] = _like_mujoco(name, values)
+            if name in MIDPHASE_FIELDS and self._midphase is None:
+                self._midphase = MidphaseMargins(self._model, self.num_envs, self._batch.expand)
+
+    @staticmethod
+    def _model_name(name: str) -> str:
+        """Return `Batch`'s name of a model field; options may leave out `opt.`."""
+        return name if name in MODEL_FIELDS else f"opt.{name}"
+
+    def _check_expandable(self, name: str) -> None:
+        if self._model_name(name) not in MODEL_FIELDS:
+            raise ValueError(f"The native engine: {_reason(self._batch.expand, name)}.")
+        value = getattr(self._model, name, None)
+        counts = isinstance(value, np.ndarray) and value.dtype.kind in "iub"
+        if (counts and name not in _FREE_INTEGERS) or name in _DERIVED_BY_ENGINE:
+            raise ValueError(
+                f"Model field {name!r} is part of the model's structure and cannot differ between "
+                "environments. Use several entities, or several tasks."
+            )
+        # The world body is always simple.
+        simple = np.flatnonzero(self._model.body_simple[1:]) + 1
+        if name in _INERTIAL_FRAME and simple.size:
+            bodies = [
+                mujoco.mj_id2name(self._model, mujoco.mjtObj.mjOBJ_BODY, int(i)) or f"#{int(i)}"
+                for i in simple
+            ]
+            raise ValueError(
+                f"Model field {name!r} cannot differ between environments, because the compiler "
+                f"simplified the inertia of bodies {', '.join(bodies)}. Build the Simulation from a "
+                "spec (spec=...), or compile those bodies with simple='false'."
+            )
+
+    def hide_geoms(self, absent: torch.Tensor) -> None:
+        # The compiler's own use of these is for bodies as a whole, and a superset does no harm.
+        for name in COLLISION_MASKS:
+            array = self._batch.expand(name)
+            array[absent.numpy()] = 0
+            self._model_tensors[name] = _as_tensor(array)
+
+    # Physics.
+
+    def step(self, nstep: int) -> None:
+        self._copy_in()
+        if self._first_steps and nstep:
+            self._first_steps -= 1
+            if nstep > 1:
+                self._call(self._batch.step, nstep=nstep - 1)
+            self._before = self._rows.clone()
+            self._call(self._batch.step)
+        else:
+            self._before = None
+            self._call(self._batch.step, nstep=nstep)
+        for name in self._inputs.keys() & _ADVANCED:
+            self._inputs[name].copy_out()
+        for field in self._outputs.values():
+            field.copy_out()
+
+    def forward(self, env_ids: torch.Tensor | None, stage: Stage = "acc") -> None:
+        if self._before is not None:
+            # A step was followed by `forward`: whatever steps read has been read once.
+            self._first_steps, self._before = 0, None
+        # A field that is read later is computed then.
+        if not self._outputs:
+            return
+        self._copy_in()
+        self._call(self._batch.forward, _as_ids(env_ids), stage=_STAGES[stage])
+        if stage == "acc":
+            if "qacc_warmstart" in self._inputs:
+                self._inputs["qacc_warmstart"].copy_out(env_ids)
+            for field in self._outputs.values():
+                field.copy_out(env_ids)
+            return
+        # An `MjData` serves many simulations: what this stage does not compute is another's.
+        for name, field in self._outputs.items():
+            if name == "sensordata":
+                field.copy_out(env_ids, self._sensor_columns[stage])
+            elif name not in ACCELERATION_FIELDS:
+                field.copy_out(env_ids)
+
+    def reset(self, env_ids: torch.Tensor | None) -> None:
+        self._copy_in_model()
+        self._batch.reset(_as_ids(env_ids), stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        for field in self._inputs.values():
+            field.copy_out(env_ids)
+        rows: Any = slice(None) if env_ids is None else env_ids
+        for name in RESULTS_ZERO_ON_RESET & self._outputs.keys():
+            self._outputs[name].values[rows] = 0
+
+    def _copy_in(self) -> None:
+        """Pass on what was written into state and model fields since the last call."""
+        for field in self._inputs.values():
+            field.copy_in()
+        self._copy_in_model()
+
+    def _copy_in_model(self) -> None:
+        for field in self._model_copies.values():
+            field.copy_in_if_versioned()
+        if self._midphase is not None:
+            self._midphase.refresh(self._model_tensors)
+
+    def _call(self, method: Any, *args: Any, **options: Any) -> None:
+        """Run a call of the batch; environments in which MuJoCo raises become NaN.
+
+        They keep the state they had, so they would stand still; as NaN they count as diverged.
+        """
+        try:
+            method(*args, **options)
+        except SimulationError as error:
+            if not self._has_warned:
+                self._has_warned = True
+                logger.warning("%s. Diverged environments are set to NaN.", error)
+            for name in ("qpos", "qvel"):
+                self._batch.bind(name)[error.ids] = np.nan
+
+    def constants_written_by(self, level: int) -> tuple[str, ...]:
+        if level == 0:
+            return ()
+        return tuple(name for name in _DERIVED_CONSTANTS if getattr(self._model, name).size)
+
+    def recompute_constants(self, level: int, env_ids: torch.Tensor | None) -> None:
+        # mj_setConst does both parts at once; the part not asked for comes out as it was.
+        self.expand(self.constants_written_by(level))
+        self._copy_in()
+        self._before = None
+        self._call(self._batch.set_const, _as_ids(env_ids))
+        # It also marks anew which frames coincide now, and these may be moved apart after it.
+        for mark in self._frame_marks.values():
+            mark[:] = 0
+        for name in self.constants_written_by(level):
+            if name in self._model_copies:
+                self._model_copies[name].copy_out(env_ids)
+
+    # Queries.
+
+    def raycast(
+        self,
+        origins: torch.Tensor,
+        directions: torch.Tensor,
+        geom_groups: tuple[int, ...] | None,
+        exclude_body_ids: torch.Tensor | None,
+        max_distances: torch.Tensor | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        self._copy_in()
+        if self._rays is None:
+            self._rays = NativeRays(
+                self._model,
+                self._batch,
+                self._make_batch,
+                lambda: (
+                    self.data_field("geom_xpos").numpy(),
+                    self.data_field("geom_xmat").numpy(),
+                ),
+            )
+        hits = self._rays.cast(
+            origins,
+            directions,
+            geom_groups,
+            exclude_body_ids,
+            max_distances,
+            self._model_tensors,
+        )
+        return (
+            torch.from_numpy(hits.distances),
+            torch.from_numpy(hits.normals),
+            torch.from_numpy(hits.geoms),
+        )
+
+    def render(self, views: tuple[CameraView, ...]) -> list[Images]:
+        if self.capabilities.render_problem is not None:
+            raise EngineUnavailableError(self.capabilities.render_problem)
+        if self._renderer is None:
+            self._renderer = NativeRenderer(
+                self._model,
+                self.num_envs,
+                self._batch.nthread,
+                self._make_batch,
+                self.data_field,
+                self._model_tensors,
+            )
+        return self._renderer.render(views)
+
+    def _make_batch(
+        self, model: mujoco.MjModel, count: int, num_threads: int | None = None
+    ) -> Batch:
+        """Make simulations of another model, for what is asked of this one."""
+        return Batch(model, count, num_threads or self._batch.nthread)
+
+    def jacobian(
+        self, points: torch.Tensor, body_ids: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        # Not `Batch.jac`, which belongs to the present qpos: in the middle of a step that is one
+        # substep newer than the positions that the points come from.
+        axes, com = self.data_field("cdof"), self.data_field("subtree_com")
+        body_ids = body_ids.long()
+        moves = self._moving_dofs[body_ids][..., None]
+        rows = torch.arange(self.num_envs)
+        arm = points - com[rows, self._tree_roots[body_ids]]
+        rotational = axes[..., :3] * moves
+        translational = axes[..., 3:] * moves
+        translational += torch.linalg.cross(rotational, arm[:, None].expand_as(rotational))
+        return translational.mT, rotational.mT
+
+    @functools.cached_property
+    def _moving_dofs(self) -> torch.Tensor:
+        """(nbody, nv) whether a body moves with a degree of freedom."""
+        moves = np.zeros((self._model.nbody, self._model.nv), dtype=np.float32)
+        for body in range(1, self._model.nbody):
+            moves[body] = moves[self._model.body_parentid[body]]
+            first = self._model.body_dofadr[body]
+            moves[body, first : first + self._model.body_dofnum[body]] = 1.0
+        return torch.from_numpy(moves)
+
+    @functools.cached_property
+    def _tree_roots(self) -> torch.Tensor:
+        """(nbody,) the body at the top of each body's tree, whose centre of mass `cdof` is about."""
+        return torch.from_numpy(self._model.body_rootid.astype(np.int64))
+
+    # Copies.
+
+    def copy_to_host(self, env_idx: int, mj_data: mujoco.MjData) -> None:
+        self._copy_in()
+        self._batch.get_data(env_idx, mj_data)
+
+    def state_dict(self) -> dict[str, Any]:
+        self._copy_in()
+        raw = {name: field.source for name, field in self._model_copies.items()}
+        return {
+            "library": "mujoco.batch",
+            "state": self._rows.clone(),
+            # Fields that were bound are bound again, because a field that is bound in the middle of
+            # a step reads values that are one substep newer than they would have been.
+            "bound": sorted(self._tensors),
+            # No forward pass gives these as the last substep did.
+            "results": {
+                name: field.values.clone()
+                for name, field in self._outputs.items()
+                if name in ACCELERATION_FIELDS or name == "sensordata"
+            },
+            "model": {
+                name: raw.get(name, value).clone() for name, value in self._model_tensors.items()
+            },
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        if state.get("library") != "mujoco.batch":
+            raise ValueError(
+                "The saved simulation is of the native engine before mujoco.batch, from which no "
+                "run can continue exactly."
+            )
+        saved = state["state"]
+        if saved.shape != self._rows.shape:
+            raise ValueError(
+                f"The saved simulation has {saved.shape[0]} environments with {saved.shape[1]} "
+                f"state values each; this one has {self._rows.shape[0]} with {self._rows.shape[1]}."
+            )
+        self._before = None
+        for name in state["bound"]:
+            self.data_field(name)
+        self.expand(tuple(state["model"]))
+        for name, value in state["model"].items():
+            if name in self._model_copies:
+                self._model_copies[name].source.copy_(value)
+                self._model_copies[name].copy_out()
+            else:
+                self._model_tensors[name].copy_(value)
+        self._rows.copy_(saved)
+        for field in self._inputs.values():
+            field.copy_out()
+        self.forward(None, "vel")
+        for name, value in state["results"].items():
+            self._outputs[name].values.copy_(value)
+
+
+class _Copy:
+    """A copy of a double-precision field in the type that crosses the seam."""
+
+    def __init__(self, source: torch.Tensor, dtype: torch.dtype) -> None:
+        # A field may be read for the first time under `inference_mode`, whose tensors count no
+        # writes and could not be written outside it.
+        with torch.inference_mode(False):
+            self.source = source
+            self.values = source.to(dtype, copy=True, memory_format=torch.contiguous_format)
+            self._seen = self.values.clone()
+            self._version = self.values._version
+
+    def copy_in(self) -> None:
+        """Copy elements that were written into the source; others keep their precision."""
+        if torch.equal(self.values, self._seen):
+            return
+        written = self.values != self._seen
+        torch.where(written, self.values.to(self.source.dtype), self.source, out=self.source)
+        self._seen.copy_(self.values)
+
+    def copy_in_if_versioned(self) -> None:
+        """Do the same if torch has counted a write, without looking at the elements otherwise."""
+        if self.values._version != self._version:
+            self.copy_in()
+            self._version = self.values._version
+
+    def copy_out(self, rows: torch.Tensor | None = None, columns: torch.Tensor | None = None) -> None:
+        """Copy the source out: all of it, or some rows, or some columns of a matrix."""
+        if columns is not None:
+            values = self.source.index_select(1, columns)
+            target = self.values if rows is None else None
+            if target is not None:
+                target.index_copy_(1, columns, values.to(target.dtype))
+            else:
+                self.values[rows[:, None], columns] = values[rows].to(self.values.dtype)
+        elif rows is None:
+            self.values.copy_(self.source)
+            self._seen.copy_(self.values)
+        else:
+            self.values.index_copy_(0, rows, self.source.index_select(0, rows).to(self.values.dtype))
+            self._seen.index_copy_(0, rows, self.values.index_select(0, rows))
+        self._version = self.values._version
+
+
+def _columns_before_acceleration(model: mujoco.MjModel) -> dict[str, torch.Tensor]:
+    """Return by stage the columns of `sensordata` that it makes current."""
+    columns = {}
+    for stage, value in _STAGES.items():
+        chosen = [
+            np.arange(adr, adr + dim)
+            for adr, dim, need in zip(
+                model.sensor_adr, model.sensor_dim, model.sensor_needstage, strict=True
+            )
+            if need <= value
+        ]
+        flat = np.concatenate(chosen) if chosen else np.zeros(0, dtype=np.int64)
+        columns[stage] = torch.from_numpy(flat.astype(np.int64))
+    return columns
+
+
+def _seam_type(source: torch.Tensor) -> torch.dtype:
+    return torch.float32 if source.dtype == torch.float64 else source.dtype
+
+
+def _as_tensor(array: np.ndarray[Any, Any]) -> torch.Tensor:
+    """View an array as a tensor, without the warning about outputs, which are not written."""
+    with torch.inference_mode(False), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return torch.from_numpy(array)
+
+
+def _like_mujoco(name: str, tensor: torch.Tensor) -> torch.Tensor:
+    """View rotation matrices as (N, ..., 3, 3), and every other field as it is."""
+    with torch.inference_mode(False):
+        return tensor.view(*tensor.shape[:-1], 3, 3) if name in ROTATION_MATRICES else tensor
+
+
+def _reason(request: Any, name: str) -> str:
+    """Return why a batch does not have a field, in its own words."""
+    try:
+        request(name)
+    except ValueError as error:
+        return str(error)
+    raise AssertionError(name)
+
+
+def _state_slice(model: mujoco.MjModel, component: mujoco.mjtState) -> slice:
+    """Return where a component stands in an integration state, whose order is that of the bits."""
+    before = int(mujoco.mjtState.mjSTATE_INTEGRATION) & (int(component) - 1)
+    start = mujoco.mj_stateSize(model, before)
+    return slice(start, start + mujoco.mj_stateSize(model, int(component)))
+
+
+def _as_ids(env_ids: torch.Tensor | None) -> np.ndarray[Any, Any] | None:
+    return None if env_ids is None else np.ascontiguousarray(env_ids.numpy())
