@@ -29,8 +29,8 @@ format:  ## Format the code and fix what lint can fix.
 	$(DEV) ruff format .
 	$(DEV) ruff check --fix .
 
-bench:  ## Measure; writes the table to benchmarks/results/.
-	$(DEV) python benchmarks/run.py
+bench:  ## Measure; writes the table to benchmarks/results/. BEFORE=../checkout to compare with.
+	$(DEV) python benchmarks/run.py $(if $(BEFORE),--before $(BEFORE))
 
 # No network and no uv: any Python with the dependencies, that of the project where there is one.
 PYTHON ?= $(or $(wildcard .venv/bin/python),python3)

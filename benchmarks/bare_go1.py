@@ -1,4 +1,4 @@
-"""The comparison: Go1 on flat ground with `mjbatch` and rsl_rl, and nothing between them.
+"""The comparison: Go1 on flat ground with `mujoco.batch` and rsl_rl, and nothing between them.
 
 Model, control, observations, commands and pushes are those of `Mjlab-Velocity-Flat-Unitree-Go1`, and
 contacts as simple as its `cpu` profile makes them (here also where the policy is evaluated); rewards
@@ -14,10 +14,10 @@ import sys
 import time
 from typing import Any
 
-import mjbatch
 import mujoco
 import numpy as np
 import torch
+from mujoco.batch import Batch
 from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
@@ -61,10 +61,11 @@ class BareGo1(VecEnv):
         self.num_envs, self.num_actions, self.device, self.cfg = num_envs, 12, "cpu", {}
         self.max_episode_length = EPISODE_STEPS
         self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)
-        self._batch = mjbatch.Batch(model, num_envs)
-        fields = (self._batch.bind(name, np.float32) for name in ("qpos", "qvel", "ctrl"))
+        self._batch = Batch(model, num_envs)
+        # Views of the rows, in double precision.
+        fields = (self._batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
         self._qpos, self._qvel, self._ctrl = (torch.from_numpy(field) for field in fields)
-        self._home = torch.from_numpy(model.key_qpos[0].astype(np.float32))
+        self._home = torch.from_numpy(model.key_qpos[0])
         names = [model.joint(i).name for i in range(1, 13)]
         scales = [next(s for k, s in GO1_ACTION_SCALE.items() if n.endswith(k[2:])) for n in names]
         self._scale = torch.tensor(scales)
@@ -83,7 +84,7 @@ class BareGo1(VecEnv):
     def _reset(self, ids: torch.Tensor) -> None:
         self._qpos[ids] = self._home
         self._qpos[ids, 2] += torch.rand(len(ids)) * 0.04 + 0.01
-        yaw = torch.rand(len(ids)) * 6.28
+        yaw = torch.rand(len(ids), dtype=torch.float64) * 6.28
         self._qpos[ids, 3], self._qpos[ids, 6] = torch.cos(yaw / 2), torch.sin(yaw / 2)
         self._qvel[ids] = 0.0
         self._action[ids] = 0.0
@@ -98,7 +99,8 @@ class BareGo1(VecEnv):
 
     def velocities(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return linear and angular velocity of the trunk in its own frame, each (N, 3)."""
-        return rotate_back(self._qpos[:, 3:7], self._qvel[:, :3]), self._qvel[:, 3:6]
+        qpos, qvel = self._qpos.float(), self._qvel.float()
+        return rotate_back(qpos[:, 3:7], qvel[:, :3]), qvel[:, 3:6]
 
     def errors(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return how far linear (N,) and angular velocity (N,) are from the command."""
@@ -117,16 +119,16 @@ class BareGo1(VecEnv):
             self._qpos[:, 7:] - self._home[7:] + 0.01 * noise[:, 9:21],
             self._qvel[:, 6:] + 1.5 * noise[:, 21:33], self._action, self._command,
         )  # fmt: skip
-        observation = torch.cat(parts, dim=-1)
+        observation = torch.cat(parts, dim=-1).float()
         return TensorDict({"actor": observation, "critic": observation}, batch_size=[self.num_envs])
 
     def _gravity(self) -> torch.Tensor:
         down = torch.tensor([0.0, 0.0, -1.0]).expand(self.num_envs, 3)
-        return rotate_back(self._qpos[:, 3:7], down)
+        return rotate_back(self._qpos[:, 3:7].float(), down)
 
     def _reward(self, action: torch.Tensor) -> torch.Tensor:
         linear, angular = self.velocities()
-        joints = self._qpos[:, 7:]
+        joints = self._qpos[:, 7:].float()
         off = (self._command[:, :2] - linear[:, :2]).square().sum(1) + linear[:, 2].square()
         turn = (self._command[:, 2] - angular[:, 2]).square() + angular[:, :2].square().sum(1)
         beyond = (joints - self._high).clamp(min=0) + (self._low - joints).clamp(min=0)
@@ -146,7 +148,7 @@ class BareGo1(VecEnv):
         self.episode_length_buf += 1
         self._time_left -= DT
         self._next_push -= DT
-        reward = self._reward(actions)
+        reward = self._reward(actions).float()
         self._action = actions.clone()
         self.falls = self._gravity()[:, 2] > -0.34
         time_outs = self.episode_length_buf >= self.max_episode_length

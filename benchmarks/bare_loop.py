@@ -1,4 +1,4 @@
-"""The comparison: cartpole swing-up with `mjbatch` and rsl_rl, and nothing between them.
+"""The comparison: cartpole swing-up with `mujoco.batch` and rsl_rl, and nothing between them.
 
 Model, reward, observations, episode length and PPO settings are those of the task; everything is
 written out by hand for this one task. `python benchmarks/bare_loop.py ITERATIONS SEED` prints the
@@ -13,10 +13,9 @@ import tempfile
 from dataclasses import asdict
 from pathlib import Path
 
-import mjbatch
 import mujoco
-import numpy as np
 import torch
+from mujoco.batch import Batch
 from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
@@ -42,21 +41,22 @@ class BareCartpole(VecEnv):
         self.num_envs, self.num_actions, self.device, self.cfg = NUM_ENVS, 1, "cpu", {}
         self.max_episode_length = MAX_EPISODE_LENGTH
         self.episode_length_buf = torch.zeros(NUM_ENVS, dtype=torch.long)
-        self._batch = mjbatch.Batch(model, NUM_ENVS)
-        fields = (self._batch.bind(name, np.float32) for name in ("qpos", "qvel", "ctrl"))
+        self._batch = Batch(model, NUM_ENVS)
+        # Views of the rows, in double precision.
+        fields = (self._batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
         self._qpos, self._qvel, self._ctrl = (torch.from_numpy(field) for field in fields)
         self._reset(torch.arange(NUM_ENVS))
 
     def _reset(self, ids: torch.Tensor) -> None:
-        self._qpos[ids] = torch.tensor([0.0, math.pi])
+        self._qpos[ids] = torch.tensor([0.0, math.pi], dtype=torch.float64)
         self._qpos[ids, 1] += torch.empty(len(ids)).uniform_(-0.034, 0.034)
-        self._qvel[ids] = torch.empty(len(ids), 2).uniform_(-0.01, 0.01)
+        self._qvel[ids] = torch.empty(len(ids), 2, dtype=torch.float64).uniform_(-0.01, 0.01)
         self.episode_length_buf[ids] = 0
 
     def get_observations(self) -> TensorDict:
         angle = self._qpos[:, 1:2]
         parts = (self._qpos[:, :1], torch.cos(angle), torch.sin(angle), self._qvel)
-        observation = torch.cat(parts, dim=-1)
+        observation = torch.cat(parts, dim=-1).float()
         return TensorDict({"actor": observation, "critic": observation}, batch_size=[self.num_envs])
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
@@ -75,7 +75,7 @@ class BareCartpole(VecEnv):
         if len(ids):
             self._reset(ids)
         extras = {"time_outs": time_outs}
-        return self.get_observations(), reward * DT, time_outs.long(), extras
+        return self.get_observations(), reward.float() * DT, time_outs.long(), extras
 
 
 def main() -> None:

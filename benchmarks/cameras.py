@@ -1,11 +1,11 @@
-"""Images a second of the native engine's cameras, beside `mjbatch`'s rays and MuJoCo's renderer.
+"""Images a second of the native engine's cameras, beside `mujoco.batch`'s rays and MuJoCo's renderer.
 
 The scene is that of `Mjlab-Lift-Cube-Yam-Rgb`: the wrist camera of the YAM arm at 32 x 32 pixels,
 which sees the cube, the ground and the arm's collision shapes. The arms stand at random poses near
 home. All take turns in one run, so that their ratios hold on a machine that others use too; and so does the CPU time of an image:
 
 - depth and segmentation, and colours as well, by `Simulation.render` (what `sim.sense()` calls);
-- the bare rays of `mjbatch`, one for each pixel against all geoms, which yield a depth and a geom;
+- the bare rays of `mujoco.batch`, one for each pixel against all geoms, which yield a depth and a geom;
 - MuJoCo's own offscreen renderer, an environment after another, where OpenGL is available: the same
   two images, and colours as the model has them, with shadows.
 
@@ -20,10 +20,10 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-import mjbatch
 import mujoco
 import numpy as np
 import torch
+from mujoco.batch import Batch
 from report import Row, show
 from timing import alternate
 
@@ -40,7 +40,7 @@ BOTH, COLOURS = "depth and segmentation", "colours"
 WANTED = {BOTH: 4000.0, COLOURS: 2500.0}
 # How many times MuJoCo's renderer in software, drawing the same images, is to be reached.
 TIMES_RENDERER = {BOTH: 100.0, COLOURS: 0.0}
-BARE, RENDERER = "bare `mjbatch.rays`", "MuJoCo's renderer"
+BARE, RENDERER = "bare `mujoco.batch` rays", "MuJoCo's renderer"
 REPEATS = 15
 
 
@@ -49,7 +49,7 @@ class BareRays:
 
     def __init__(self, sim: Simulation, camera_id: int, groups: tuple[int, ...]) -> None:
         model = sim.mj_model
-        self._batch = mjbatch.Batch(model, sim.num_envs)
+        self._batch = Batch(model, sim.num_envs)
         for name in ("qpos", "mocap_pos", "mocap_quat"):
             self._batch.bind(name)[:] = getattr(sim.data, name).numpy()
         rays = _pixel_rays(model.cam_fovy[camera_id])
@@ -59,12 +59,12 @@ class BareRays:
         self._origins = np.ascontiguousarray(pos[:, None].expand(*shape, 3).numpy())
         self._mask = np.zeros(6, dtype=np.uint8)
         self._mask[list(groups)] = 1
-        self.distances = np.empty(shape, dtype=np.float32)
+        self.distances = np.empty(shape)
         self.geoms = np.empty(shape, dtype=np.int32)
 
     def __call__(self) -> None:
-        self._batch.rays(
-            self._origins, self._directions, self.distances, self.geoms, geomgroup=self._mask
+        self.distances, self.geoms = self._batch.ray(
+            self._origins, self._directions, geomgroup=self._mask
         )
 
 

@@ -60,7 +60,7 @@ def measure() -> list[Row]:
         Row(
             "time from `train` on the command line to that point, evaluations included",
             ", ".join(f"{value:.1f} s" for value in seconds),
-            "bare loop (mjbatch and rsl_rl), as many iterations, without evaluation: "
+            "bare loop (mujoco.batch and rsl_rl), as many iterations, without evaluation: "
             + ", ".join(f"{value:.1f} s" for value in bare),
             "under 20 s",
             max(seconds) < 20,

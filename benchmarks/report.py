@@ -45,7 +45,6 @@ def show(rows: list[Row]) -> str:
 
 def write(rows: list[Row]) -> None:
     """Write the table, with the machine it was measured on, as Markdown and JSON."""
-    import mjbatch  # noqa: F401 - a benchmark without the engine would be of something else.
     import mujoco
     import torch
 

@@ -1,13 +1,22 @@
-"""Run every benchmark and write the table: `make bench`."""
+"""Run every benchmark and write the table: `make bench`.
+
+With `--before FOLDER`, a checkout of an earlier commit with its own `.venv`, its `env.step` is measured
+beside ours: `make bench BEFORE=../before`.
+"""
 
 from __future__ import annotations
 
+import argparse
+from pathlib import Path
+
 import cameras
 import engines_agree
+import growth
 import learning
 import live_view
 import reach
 import repeatability
+import side_by_side
 import startup
 import tasks
 import throughput
@@ -16,8 +25,14 @@ from report import RESULTS, Row, show, write
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--before", type=Path, help="checkout to compare `env.step` with")
+    before = parser.parse_args().before
     rows: list[Row] = []
-    quick = (throughput, tasks, cameras, reach, startup, repeatability)
+    if before is not None:
+        rows += side_by_side.measure(before.resolve())
+        write(rows)
+    quick = (throughput, tasks, growth, cameras, reach, startup, repeatability)
     for benchmark in (*quick, learning, live_view, walking, engines_agree):
         print(f"{benchmark.__name__} ...", flush=True)
         rows += benchmark.measure()

@@ -1,4 +1,4 @@
-"""Speed of `env.step`: over a bare `mjbatch` loop, and of two threads over one."""
+"""Speed of `env.step`: over a bare `mujoco.batch` loop, and of two threads over one."""
 
 from __future__ import annotations
 
@@ -51,15 +51,15 @@ def measure() -> list[Row]:
         Row(
             f"cartpole, {NUM_ENVS} envs, 2 threads: `env.step` over the bare loop",
             f"{over_bare:.2f} ({NUM_ENVS / env_time:,.0f} env-steps/s)",
-            f"bare `mjbatch` loop: {NUM_ENVS / bare_time:,.0f} env-steps/s",
-            "at least 0.85",
-            over_bare >= 0.85,
+            f"bare `mujoco.batch` loop: {NUM_ENVS / bare_time:,.0f} env-steps/s",
+            "at least 0.90",
+            over_bare >= 0.90,
         ),
         Row(
             "the same, with `xpos` read: the task alone reads only `qpos` and `qvel`, for which the "
             "native engine leaves out the forward",
             f"{over_bare_reading:.2f} ({NUM_ENVS / reading_time:,.0f} env-steps/s)",
-            f"bare `mjbatch` loop: {NUM_ENVS / bare_again:,.0f} env-steps/s",
+            f"bare `mujoco.batch` loop: {NUM_ENVS / bare_again:,.0f} env-steps/s",
             "at least 0.85",
             over_bare_reading >= 0.85,
         ),

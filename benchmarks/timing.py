@@ -1,4 +1,4 @@
-"""Timing that several things take turns in, and the bare `mjbatch` loop they are compared with."""
+"""Timing that several things take turns in, and the bare `mujoco.batch` loop they are compared with."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-import mjbatch
 import mujoco
 import numpy as np
 import torch
+from mujoco.batch import Batch
 
 Sample = Callable[[], Any]
 
@@ -48,16 +48,16 @@ def alternate(
 
 
 class BareLoop:
-    """The physics of one environment step on `mjbatch`, and nothing else.
+    """The substeps of one environment step on `mujoco.batch`, and nothing else.
 
-    State goes in and out as double-precision views, which cost `mjbatch` nothing, and no derived
-    quantity is copied out.
+    State goes in and out as double-precision views, which cost nothing, and no derived quantity is
+    copied out.
     """
 
     def __init__(
         self, model: mujoco.MjModel, num_envs: int, num_threads: int, decimation: int
     ) -> None:
-        self._batch = mjbatch.Batch(model, num_envs, num_threads)
+        self._batch = Batch(model, num_envs, num_threads)
         self._decimation = decimation
         names = ["qpos", "qvel", "ctrl"]
         if model.nmocap > 0:
@@ -65,7 +65,7 @@ class BareLoop:
             names += ["mocap_pos", "mocap_quat"]
         self.state = {name: self._batch.bind(name) for name in names}
         self.qpos, self.qvel, self.ctrl = (self.state[name] for name in names[:3])
-        self._rays: list[dict[str, np.ndarray]] = []
+        self._rays: list[dict[str, Any]] = []
 
     def expand(self, fields: Mapping[str, torch.Tensor]) -> None:
         """Give every simulation its own values (num_envs, ...) of these model fields."""
@@ -83,14 +83,12 @@ class BareLoop:
                 {
                     "pnt": np.ascontiguousarray(origins, dtype=np.float64),
                     "vec": np.ascontiguousarray(directions, dtype=np.float64),
-                    "dist": np.empty(origins.shape[:2]),
-                    "normal": np.empty(origins.shape),
+                    "normal": True,
                     "geomgroup": mask,
                 }
             )
 
     def __call__(self) -> None:
         self._batch.step(nstep=self._decimation)
-        self._batch.forward()
         for rays in self._rays:
-            self._batch.rays(**rays)
+            self._batch.ray(**rays)

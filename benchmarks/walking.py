@@ -51,7 +51,7 @@ def measure(seeds: tuple[int, ...] = SEEDS) -> list[Row]:
             "Go1 flat, `--profile cpu`, two cores, seeds "
             f"{', '.join(map(str, seeds))}: time from `train` until it stops because it tracks the velocity command",
             "; ".join(_shown(run) for run in runs),
-            "bare loop (mjbatch and rsl_rl, rewards by hand, same PPO settings without mirror images, "
+            "bare loop (mujoco.batch and rsl_rl, rewards by hand, same PPO settings without mirror images, "
             f"at most {LIMIT_MINUTES} min): {_shown_bare(beside)}",
             f"under {LIMIT_MINUTES} min",
             all(

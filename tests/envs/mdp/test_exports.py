@@ -26,7 +26,7 @@ def test_terms_need_no_environment_viewer_or_engine() -> None:
     code = (
         "import sys, mjlab.envs.mdp\n"
         "loaded = [m for m in ('mjlab.envs.manager_based_rl_env', 'mjlab.viewer', 'warp', "
-        "'mujoco_warp', 'mjbatch', 'rsl_rl') if m in sys.modules]\n"
+        "'mujoco_warp', 'mujoco.batch', 'rsl_rl') if m in sys.modules]\n"
         "assert not loaded, loaded\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
