@@ -2,7 +2,7 @@
 UV := ./tools/uv
 DEV := $(UV) run --group dev
 
-.PHONY: help train test test-slow test-gpu-script check format bench gpu packages docs
+.PHONY: help train test test-slow test-gpu-script test-mujoco-next check format bench gpu packages docs
 
 help:  ## Show this list.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -18,6 +18,17 @@ test-slow:  ## Run the tests that take long.
 
 test-gpu-script:  ## Run every part of `make gpu` at tiny sizes, without a GPU.
 	$(DEV) pytest -m slow tests/benchmarks/test_gpu.py
+
+# MuJoCo 4 is `mujoco-core` and a viewer. Other dependencies are those that the project resolves to.
+# The project's constraints name the release that it pins, so its configuration is left out.
+NEXT := $(CURDIR)/.venv-next
+test-mujoco-next:  ## Run tests/sim on MuJoCo 4.0.1 and MuJoCo Warp 4.0.0, in an environment apart.
+	$(UV) venv -q --allow-existing --python 3.11 $(NEXT)
+	$(UV) export -q --group dev --no-hashes --no-emit-project --no-emit-package mujoco \
+		--no-emit-package mujoco-warp > $(NEXT)/pinned.txt
+	$(UV) pip install -q --no-config --python $(NEXT) --no-deps -r $(NEXT)/pinned.txt \
+		mujoco-core==4.0.1 mujoco-warp==4.0.0 -e .
+	$(NEXT)/bin/python -m pytest -n 2 -m "not slow" tests/sim
 
 check:  ## Check format, lint, types and import layers.
 	$(DEV) ruff format --check .

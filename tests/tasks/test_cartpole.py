@@ -7,14 +7,15 @@ import math
 import numpy as np
 import pytest
 import torch
-from dm_control.suite import cartpole as suite
-from dm_control.utils import rewards
 from hypothesis import given
 from hypothesis import strategies as st
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.tasks.cartpole import cartpole_env_cfg as task
 from mjlab.tasks.registry import load_env_cfg
+
+suite = pytest.importorskip("dm_control.suite.cartpole")
+rewards = pytest.importorskip("dm_control.utils.rewards")
 
 NUM_ENVS = 64
 
