@@ -6,6 +6,7 @@ that holds a Warp array or struct of its own, such as `sim.wp_data`. Importing t
 
 from __future__ import annotations
 
+from functools import partialmethod
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 if TYPE_CHECKING:
@@ -70,21 +71,16 @@ class TorchArray:
         named = {name: _unwrap(value) for name, value in (kwargs or {}).items()}
         return func(*plain, **named)
 
-
-def _operator(name: str) -> Any:
-    def operate(self: TorchArray, *others: Any) -> Any:
-        return getattr(self._tensor, name)(*[_unwrap(other) for other in others])
-
-    operate.__name__ = name
-    return operate
+    def _operate(self, operator: str, *others: Any) -> Any:
+        return getattr(self._tensor, operator)(*[_unwrap(other) for other in others])
 
 
 # Python looks operators up on the class and never asks `__getattr__`.
 for _name in ("add", "sub", "mul", "truediv", "floordiv", "mod", "pow", "matmul", "and", "or"):
-    setattr(TorchArray, f"__{_name}__", _operator(f"__{_name}__"))
-    setattr(TorchArray, f"__r{_name}__", _operator(f"__r{_name}__"))
+    setattr(TorchArray, f"__{_name}__", partialmethod(TorchArray._operate, f"__{_name}__"))
+    setattr(TorchArray, f"__r{_name}__", partialmethod(TorchArray._operate, f"__r{_name}__"))
 for _name in ("neg", "abs", "invert", "lt", "le", "gt", "ge", "eq", "ne", "float", "int", "bool"):
-    setattr(TorchArray, f"__{_name}__", _operator(f"__{_name}__"))
+    setattr(TorchArray, f"__{_name}__", partialmethod(TorchArray._operate, f"__{_name}__"))
 TorchArray.__hash__ = object.__hash__
 
 
