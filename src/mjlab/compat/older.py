@@ -26,7 +26,8 @@ from mjlab.envs.mdp.dr._core import FieldRow, randomize
 from mjlab.envs.mdp.dr._selection import BODY, GEOM, SITE
 from mjlab.envs.mdp.dr._table import TABLE
 from mjlab.envs.mdp.dr._terms import ROBOT
-from mjlab.managers.model_fields import RecomputeLevel, derived_fields
+from mjlab.managers.model_fields import derived_fields
+from mjlab.sim.randomization import RecomputeLevel
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity

@@ -29,9 +29,15 @@ from mjlab.entity._variant_slots import SlotKey as SlotKey
 from mjlab.entity._variant_slots import VariantSlot as VariantSlot
 from mjlab.entity._variant_values import KINDS, VariantTable
 from mjlab.entity.entity import Entity, EntityCfg
-from mjlab.sim.field_lists import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
-from mjlab.sim.variants import VARIANT_DEPENDENT_FIELDS as VARIANT_DEPENDENT_FIELDS
-from mjlab.sim.variants import VariantColumns, VariantInfo, VariantValues
+from mjlab.sim.randomization import (
+    CONSTANTS_AT_QPOS0,
+    FIXED_CONSTANTS,
+    VariantColumns,
+    VariantInfo,
+    VariantValues,
+    put_variant_model,
+)
+from mjlab.sim.randomization import VARIANT_DEPENDENT_FIELDS as VARIANT_DEPENDENT_FIELDS
 
 InertialMode = Literal["mesh-derived", "diagonal", "fullinertia"]
 """Source of a body's inertia: its geoms, `diaginertia` or `fullinertia`."""
@@ -311,7 +317,6 @@ def build_variant_model(
     Raises:
         ValueError: the spec does not compile, with MuJoCo's message.
     """
-    from mjlab.sim.warp.engine import put_variant_model
     from mjlab.sim.simulation import compile_spec
 
     model = compile_spec(spec)

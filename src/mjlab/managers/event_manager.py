@@ -14,7 +14,6 @@ from mjlab.compat import accepts_older_fields
 from mjlab.managers.debug_vis import TermFunctionSwitches
 from mjlab.managers.env_ids import as_ids, is_empty
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
-from mjlab.managers.model_fields import RecomputeLevel as RecomputeLevel
 from mjlab.managers.model_fields import (
     declared_model_fields,
     declared_recompute,
@@ -22,6 +21,7 @@ from mjlab.managers.model_fields import (
 )
 from mjlab.managers.model_fields import requires_model_fields as requires_model_fields
 from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.sim.randomization import RecomputeLevel as RecomputeLevel
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv

@@ -3,26 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from enum import IntEnum
 from typing import Any, TypeVar
 
+from mjlab.sim.randomization import RecomputeLevel
+
 F = TypeVar("F", bound=Callable[..., Any])
-
-
-class RecomputeLevel(IntEnum):
-    """Which constants of the model derive from what was changed.
-
-    `set_const_0` does not include `set_const_fixed`: together they are `set_const`.
-    """
-
-    none = 0
-    """None."""
-    set_const_fixed = 1
-    """Those that do not depend on a configuration (body_subtreemass)."""
-    set_const_0 = 2
-    """Those evaluated at qpos0 (inverse weights, tendon lengths, actuator acc0)."""
-    set_const = 3
-    """Both."""
 
 
 _DERIVED = {

@@ -1,9 +1,9 @@
-"""The seam between mjlab and a physics engine.
+"""Contract between mjlab and a physics engine.
 
-Everything above this file sees batched torch tensors; everything below it is one engine's own
-business. `sim/native/` and `sim/warp/` are the only two implementations and the only two folders
+Everything above this file sees batched torch tensors; everything below it is internal to one
+engine. `sim/native/` and `sim/warp/` are the only two implementations and the only two folders
 that import `mujoco.batch`, `warp` or `mujoco_warp`. `create_engine` imports them lazily, so a CPU
-run never loads Warp and `import mjlab.envs` works where Warp is missing.
+run never loads Warp and `import mjlab.envs` works without Warp.
 """
 
 from __future__ import annotations
@@ -11,21 +11,151 @@ from __future__ import annotations
 import importlib
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import mujoco
+import torch
 
 if TYPE_CHECKING:
-    import mujoco
-    import torch
-
     from mjlab.sim.config import SimulationCfg
-    from mjlab.sim.rendering import CameraView, Images
-
 
 Stage = Literal["pos", "vel", "acc"]
-"""How far a forward pass goes: positions; positions and velocities; everything."""
+"""Last stage of a forward pass: positions; positions and velocities; everything."""
 
 # Fields that MuJoCo stores as nine numbers in a row and that cross the seam as 3 x 3 matrices.
 ROTATION_MATRICES = frozenset({"xmat", "ximat", "geom_xmat", "site_xmat", "cam_xmat", "cam_mat0"})
+
+# Inputs of the next step that a reset sets to zero.
+ZERO_INPUTS = (
+    *("time", "qvel", "act", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "userdata"),
+)
+# All inputs of the next step: written by the user, or carried on by the step itself.
+INPUTS = (*ZERO_INPUTS, "qpos", "eq_active", "mocap_pos", "mocap_quat")
+
+# Results that MuJoCo's reset clears too.
+RESULTS_ZERO_ON_RESET = frozenset({"qacc", "act_dot", "sensordata"})
+
+# Derived fields that a forward pass computes in its last stage, beside columns of `sensordata`.
+ACCELERATION_FIELDS = frozenset(
+    {"qacc", "qacc_smooth", "qfrc_smooth", "qfrc_constraint", "qfrc_actuator", "qfrc_inverse"}
+    | {"actuator_force", "act_dot", "cacc", "cfrc_int", "cfrc_ext"}
+    | {"solver", "solver_niter", "solver_nnz", "solver_fwdinv"}
+)
+
+# Which geoms may touch each other.
+COLLISION_MASKS = ("geom_contype", "geom_conaffinity")
+
+_SENSORS_BY_FIELD = {
+    **dict.fromkeys(
+        ("cacc", "cfrc_int", "cfrc_ext"),
+        ("accelerometer", "force", "torque", "framelinacc", "frameangacc"),
+    ),
+    **dict.fromkeys(("subtree_linvel", "subtree_angmom"), ("subtreelinvel", "subtreeangmom")),
+}
+
+
+def check_sensor_fed(model: mujoco.MjModel, field: str) -> None:
+    """Check that MuJoCo computes a data field in `model`; some it computes for sensors only.
+
+    Without such a sensor they hold zeros on one engine and intermediate results on the other.
+
+    Raises:
+        AttributeError: names the sensors of which one must be added, or what to read instead.
+    """
+    if field == "qfrc_inverse":
+        # No step runs inverse dynamics, so it would read zero for ever.
+        raise AttributeError(
+            "MuJoCo computes MjData.qfrc_inverse in inverse dynamics only, which no step runs. The "
+            "forces that drive the joints are qfrc_actuator + qfrc_applied."
+        )
+    sensors = _SENSORS_BY_FIELD.get(field, ())
+    types = [getattr(mujoco.mjtSensor, f"mjSENS_{name.upper()}") for name in sensors]
+    if sensors and not any((model.sensor_type == kind).any() for kind in types):
+        raise AttributeError(
+            f"MuJoCo computes MjData.{field} only if the model has a sensor that needs it. Add one "
+            f"of these sensors to it: {', '.join(sensors)}."
+        )
+
+
+# Rendering.
+
+CameraDataType = Literal["rgb", "depth", "segmentation"]
+"""Type of an image."""
+
+CAMERA_DATA_TYPES: tuple[str, ...] = get_args(CameraDataType)
+NUM_GEOM_GROUPS = 6
+
+LENS_FIELDS = frozenset({"cam_fovy", "cam_intrinsic"})
+"""Model fields that determine the rays of a camera's pixels."""
+
+# Segmentation of pixels without a geom.
+BACKGROUND = -1
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """One camera of the model, and which images of it to render."""
+
+    camera_id: int
+    """Camera in the model."""
+    width: int
+    """Columns of the image."""
+    height: int
+    """Rows of the image."""
+    data_types: tuple[str, ...]
+    """Some of `CAMERA_DATA_TYPES`; the others are not computed."""
+    geom_groups: tuple[int, ...]
+    """Groups of the visible geoms, ascending."""
+    use_textures: bool = True
+    """Show the textures of materials."""
+    use_shadows: bool = False
+    """Count an obstructed light 0.3."""
+
+
+@dataclass
+class Images:
+    """Images of a view in each of N environments; None for types that the view does not have.
+
+    The first row of an image is at its top. The tensors are overwritten by the next rendering.
+    """
+
+    rgb: torch.Tensor | None = None
+    """(N, height, width, 3) uint8."""
+    depth: torch.Tensor | None = None
+    """(N, height, width, 1) float32: depth along the optical axis (m), 0 without a geom."""
+    segmentation: torch.Tensor | None = None
+    """(N, height, width, 2) int32: id and type of the object, -1 and -1 without a geom."""
+
+    @classmethod
+    def empty(cls, view: CameraView, num_envs: int, device: str | torch.device) -> Images:
+        """Allocate images that show nothing."""
+        shape = (num_envs, view.height, view.width)
+        images = cls()
+        if "rgb" in view.data_types:
+            images.rgb = torch.zeros(*shape, 3, dtype=torch.uint8, device=device)
+        if "depth" in view.data_types:
+            images.depth = torch.zeros(*shape, 1, device=device)
+        if "segmentation" in view.data_types:
+            images.segmentation = torch.full(
+                (*shape, 2), BACKGROUND, dtype=torch.int32, device=device
+            )
+        return images
+
+
+def rendered_geoms(model: mujoco.MjModel, groups: tuple[int, ...]) -> list[int]:
+    """Return the geoms of some groups, ascending.
+
+    MuJoCo counts a group beyond 0 to 5 as the nearest of these.
+    """
+    return [i for i, group in enumerate(model.geom_group.clip(0, 5)) if group in groups]
+
+
+def far_limit(model: mujoco.MjModel) -> float:
+    """Return the depth in meters beyond which nothing is visible; 0 for no limit."""
+    return float(model.vis.map.zfar * model.stat.extent)
+
+
+# Engine.
 
 
 class EngineUnavailableError(RuntimeError):

@@ -6,7 +6,7 @@ import copy
 import logging
 from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,20 +14,18 @@ import torch
 
 from mjlab.sim.config import SimulationCfg
 from mjlab.sim.engine import (
+    COLLISION_MASKS,
+    CameraView,
     Capabilities,
     EngineUnavailableError,
+    Images,
     Stage,
     create_engine,
     resolve_engine_name,
 )
-from mjlab.sim.field_lists import COLLISION_MASKS
 from mjlab.sim.fields import FieldView, SharedField
-from mjlab.sim.variants import VariantInfo, VariantValues
+from mjlab.sim.randomization import RecomputeLevel, VariantInfo, VariantValues
 from mjlab.utils.nan_guard import NanGuard
-
-if TYPE_CHECKING:
-    from mjlab.managers.event_manager import RecomputeLevel
-    from mjlab.sim.rendering import CameraView, Images
 
 logger = logging.getLogger(__name__)
 
@@ -238,7 +236,7 @@ class Simulation:
             try:
                 self.expand_model_fields((name,))
             except ValueError as error:
-                raise ValueError(variants.refusal(name, error)) from error
+                raise ValueError(variants.describe_error(name, error)) from error
         # The mean inertia, which is no field, scales the solver's tolerance.
         self.recompute_constants(3)
         for name in dict.fromkeys((*variants.fields, *derived)):
