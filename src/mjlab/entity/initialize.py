@@ -68,7 +68,7 @@ def _joint_limits(model: Any, indexing: EntityIndexing) -> torch.Tensor:
     ids = indexing.joint_ids.long()
     # Read from the simulation, because variants of an entity may have limits of their own.
     limits = model.jnt_range[:, ids].clone().float()
-    limited = model.jnt_limited[:, ids].bool()
+    limited = model.jnt_limited[..., ids].bool()
     limits[..., 0].masked_fill_(~limited, -torch.inf)
     limits[..., 1].masked_fill_(~limited, torch.inf)
     return limits

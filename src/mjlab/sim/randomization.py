@@ -56,6 +56,30 @@ VARIANT_DEPENDENT_FIELDS = (
 
 Other fields are per environment too if the variants differ in them."""
 
+# Whole numbers and flags that every engine can hold per environment. All others are structure.
+_PER_ENV_INTEGERS = frozenset(
+    {"geom_dataid", "geom_matid", "mat_texid", "mat_texuniform"}
+    | {"light_active", "light_castshadow", "light_type"}
+)
+# Real numbers that MuJoCo Warp shares: assets, keyframes, flexes, and single fields.
+_SHARED_KINDS = frozenset(
+    {"bvh", "efm0", "flex", "flexedge", "hfield", "key", "mesh", "numeric", "oct", "skin", "tuple"}
+    | {"wrap"}
+)
+_SHARED_FIELDS = frozenset(
+    {"cam_sensorsize", "dof_length", "geom_fluid", "sensor_cutoff", "site_size"}
+)
+
+
+def is_structure(field: str, value: np.ndarray) -> bool:
+    """Return True if a model field has no environment dimension as long as it is not expanded.
+
+    The rule is that of MuJoCo Warp's model, on both engines.
+    """
+    if value.dtype.kind != "f":
+        return field not in _PER_ENV_INTEGERS
+    return field in _SHARED_FIELDS or field.partition("_")[0] in _SHARED_KINDS
+
 
 # MuJoCo Warp's models.
 

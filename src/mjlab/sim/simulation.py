@@ -1,9 +1,10 @@
-"""The facade over the physics engine: one class, whichever engine runs below it."""
+"""Facade over the physics engine: one class, whichever engine runs below it."""
 
 from __future__ import annotations
 
 import copy
 import logging
+import math
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any
@@ -23,21 +24,114 @@ from mjlab.sim.engine import (
     create_engine,
     resolve_engine_name,
 )
-from mjlab.sim.fields import FieldView, SharedField
-from mjlab.sim.randomization import RecomputeLevel, VariantInfo, VariantValues
+from mjlab.sim.randomization import RecomputeLevel, VariantInfo, VariantValues, is_structure
 from mjlab.utils.nan_guard import NanGuard
 
 logger = logging.getLogger(__name__)
 
 EnvIds = torch.Tensor | slice | None
 
+# Shapes of rows that MuJoCo stores flat, as MuJoCo Warp has them.
+_ROW_SHAPES = {"cam_mat0": (3, 3), "geom_aabb": (2, 3)}
+
+
+class FieldView:
+    """Read-only namespace over the fields of `data`, `model` or `model.opt`.
+
+    A field is looked up once and then held as a plain attribute, so that reading it again costs
+    nothing. Write into the tensors in place (`data.qpos[ids] = ...`).
+    """
+
+    def __init__(self, lookup: Callable[[str], Any], nworld: int, struct: str) -> None:
+        self.__dict__.update(_lookup=lookup, nworld=nworld, _struct=struct)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        value = self.__dict__["_lookup"](name)
+        self.__dict__[name] = value
+        return value
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # `data.qpos += 1` writes in place and then assigns the tensor to itself.
+        if value is self.__dict__.get(name):
+            return
+        raise AttributeError(
+            f"{self._struct}.{name} cannot be replaced; write into it in place: "
+            f"{self._struct}.{name}[:] = ..."
+        )
+
+    def forget(self, names: tuple[str, ...]) -> None:
+        """Drop held fields, so that the next access looks them up again."""
+        for name in names:
+            self.__dict__.pop(name, None)
+
+
+class SharedField(torch.Tensor):
+    """Model value that all environments share: reading is free, writing raises `RuntimeError`.
+
+    Writing one row would change every environment. Results of operations are plain tensors.
+    """
+
+    field_name: str
+    is_structure: bool
+
+    @classmethod
+    def make(cls, value: torch.Tensor, nworld: int | None, name: str) -> SharedField:
+        """View `value` as an (nworld, ...) field; as structure, in its own shape, if None."""
+        view = value if nworld is None else value.expand(nworld, *value.shape)
+        field = torch.Tensor._make_subclass(cls, view)
+        field.field_name, field.is_structure = name, nworld is None
+        return field
+
+    @classmethod
+    def __torch_function__(
+        cls, func: Any, types: Any, args: Any = (), kwargs: Any | None = None
+    ) -> Any:
+        target = args[0] if args else None
+        name = getattr(func, "__name__", "")
+        writes = name == "__setitem__" or (name.endswith("_") and not name.endswith("__"))
+        out = (kwargs or {}).get("out")
+        outputs = out if isinstance(out, tuple | list) else (out,)
+        for tensor in (target, *outputs) if writes else outputs:
+            if isinstance(tensor, SharedField):
+                tensor._raise()
+        with torch._C.DisableTorchFunctionSubclass():
+            result = func(*args, **(kwargs or {}))
+        # Views still alias the shared value, so they stay protected.
+        if isinstance(target, SharedField):
+            if isinstance(result, np.ndarray):
+                result.flags.writeable = False
+            elif (
+                isinstance(result, torch.Tensor)
+                and result.untyped_storage().data_ptr() == target.untyped_storage().data_ptr()
+            ):
+                result = result.as_subclass(cls)
+                result.field_name, result.is_structure = target.field_name, target.is_structure
+        return result
+
+    def _raise(self) -> None:
+        name = self.field_name
+        raise RuntimeError(
+            f"Model field {name!r} is shared by all environments and cannot be written. "
+            + (
+                "Change it in the spec or the model from which the Simulation is built."
+                if self.is_structure
+                else f"Call sim.expand_model_fields(({name!r},)) first, or declare it with "
+                f"@requires_model_fields({name!r})."
+            )
+        )
+
 
 class Simulation:
     """N copies of one MuJoCo model, advanced together by the configured engine.
 
     Fields are `sim.data.<field>` and `sim.model.<field>`: torch tensors (float32, int32 or bool)
-    with MuJoCo's names and a leading environment dimension, live and written in place; rotation
-    matrices are (..., 3, 3).
+    with MuJoCo's names and a leading environment dimension, live and written in place. Rotation
+    matrices are (..., 3, 3), and `geom_aabb` is (N, ngeom, 2, 3): center and half sizes. Sizes
+    (`model.nv`) are ints. Structure (addresses, ids, types, flags, assets: `model.geom_bodyid`) has
+    no environment dimension as long as it is not expanded. Options are `sim.model.opt.<field>`:
+    real numbers (N, ...), whole numbers ints.
 
     After `step`, `qpos`, `qvel`, `act` and `time` are current, and every derived field (`xpos`,
     `cvel`, `sensordata`, ...) belongs to the state before the last physics substep. After
@@ -85,7 +179,8 @@ class Simulation:
         self._variants: VariantValues | None = None
         self._engine = create_engine(engine_name, self._mj_model, num_envs, cfg, device)
         self._data = FieldView(self._engine.data_field, num_envs, "data")
-        self._model = FieldView(self._lookup_model_field, num_envs, "model")
+        self._model = FieldView(self._read_model_field, num_envs, "model")
+        self._options = FieldView(self._read_option, num_envs, "model.opt")
         self._expanded: set[str] = set()
         if variant_info:
             self._apply_variants(variant_info)
@@ -99,7 +194,7 @@ class Simulation:
         )
         logger.debug("Physics: %s, %d environments.", self.capabilities.description, num_envs)
 
-    # What there is.
+    # Properties.
 
     @property
     def capabilities(self) -> Capabilities:
@@ -118,7 +213,7 @@ class Simulation:
 
     @property
     def model(self) -> FieldView:
-        """Live `MjModel` fields, (N, ...); those not expanded are shared and read-only."""
+        """Live `MjModel` fields; those not expanded are shared and read-only."""
         return self._model
 
     @property
@@ -131,23 +226,38 @@ class Simulation:
         """Host data of the compiled model, forwarded once at `qpos0`."""
         return self._mj_data
 
+    # Escape hatch of the Warp engine.
+
     @property
     def wp_model(self) -> Any:
         """MuJoCo Warp's model; AttributeError on another engine."""
-        return self._warp_struct("wp_model")
+        return self._warp_engine("wp_model", "sim.model").wp_model
 
     @property
     def wp_data(self) -> Any:
         """MuJoCo Warp's data; AttributeError on another engine."""
-        return self._warp_struct("wp_data")
+        return self._warp_engine("wp_data", "sim.data").wp_data
 
-    def _warp_struct(self, name: str) -> Any:
+    @property
+    def wp_device(self) -> Any:
+        """Warp's device; AttributeError on another engine."""
+        return self._warp_engine("wp_device", "sim.device").wp_data.time.device
+
+    def render_context(self, views: tuple[CameraView, ...], view: CameraView) -> Any:
+        """Return MuJoCo Warp's context of a view, one of `views` that were rendered together.
+
+        AttributeError on another engine, RuntimeError before the first rendering.
+        """
+        engine = self._warp_engine("render_context", "the images of camera sensors")
+        return engine.render_context(views, view)
+
+    def _warp_engine(self, name: str, instead: str) -> Any:
         if self.engine_name != "warp":
             raise AttributeError(
-                f"Simulation.{name} exists on the warp engine only; this is {self.engine_name}. "
-                "Use sim.data and sim.model, which work on both."
+                f"Simulation.{name} exists on the warp engine only, and this is "
+                f"{self.engine_name}; use {instead}, which works on both."
             )
-        return getattr(self._engine, name)
+        return self._engine
 
     # Model fields.
 
@@ -194,38 +304,46 @@ class Simulation:
         The baseline for randomization by scaling or adding, so that it never drifts. float32 where
         MuJoCo has doubles. Raises ValueError for a field that does not exist.
         """
+        field = field.removeprefix("opt.")
         if field not in self._default_fields:
-            self._default_fields[field] = self._host_field(field)
+            value = self._host_value(field)
+            if self._variants is not None and field in self._variants.fields:
+                value = self._variants.get(field)
+            array = np.array(value)
+            if array.dtype == np.float64:
+                array = array.astype(np.float32)
+            tensor = _reshape_rows(field, torch.from_numpy(array))
+            self._default_fields[field] = tensor.to(self.device)
         return self._default_fields[field]
 
-    def _host_field(self, field: str) -> torch.Tensor:
-        source: Any = self._default_model
-        if not hasattr(source, field) and hasattr(source.opt, field):
-            source = source.opt
-        value = getattr(source, field, None)
-        if field in self.per_world_default_fields:
-            assert self._variants is not None
-            value = self._variants.get(field)
-        if field.startswith("_") or value is None or callable(value):
+    def _host_value(self, field: str) -> Any:
+        model = self._default_model
+        value = getattr(model, field, getattr(model.opt, field, None))
+        if field.startswith("_") or not isinstance(value, np.ndarray | int | float | bytes):
             raise ValueError(
                 f"MjModel has no field {field!r}. Fields carry MuJoCo's names, such as "
-                "'body_mass' or 'geom_friction'."
+                "'body_mass' or 'geom_friction'; structs are those of sim.mj_model."
             )
-        array = np.array(value)
-        if array.dtype == np.float64:
-            array = array.astype(np.float32)
-        if field.endswith("mat0") and array.shape[-1:] == (9,):
-            array = array.reshape(*array.shape[:-1], 3, 3)
-        return torch.from_numpy(array).to(self.device)
+        return value
 
-    def _lookup_model_field(self, name: str) -> torch.Tensor:
+    def _read_model_field(self, name: str) -> Any:
+        if name == "opt":
+            return self._options
         if self._engine.is_expanded(name):
-            return self._engine.model_field(name)
+            return _reshape_rows(name, self._engine.model_field(name))
         try:
-            value = self.get_default_field(name)
+            value = self._host_value(name)
         except ValueError as error:
             raise AttributeError(str(error)) from error
-        return SharedField.make(value, self.num_envs, name)
+        if isinstance(value, int | bytes):
+            return value
+        rows = None if is_structure(name, np.asarray(value)) else self.num_envs
+        return SharedField.make(self.get_default_field(name), rows, name)
+
+    def _read_option(self, name: str) -> Any:
+        if not hasattr(self._default_model.opt, name):
+            raise AttributeError(f"MjOption has no field {name!r}.")
+        return self._read_model_field(name)
 
     def _apply_variants(self, info: list[tuple[str, VariantInfo]]) -> None:
         """Give every environment the model fields of its own variants."""
@@ -237,10 +355,10 @@ class Simulation:
                 self.expand_model_fields((name,))
             except ValueError as error:
                 raise ValueError(variants.describe_error(name, error)) from error
-        # The mean inertia, which is no field, scales the solver's tolerance.
+        # The mean inertia, which is not a field, scales the solver's tolerance.
         self.recompute_constants(3)
         for name in dict.fromkeys((*variants.fields, *derived)):
-            self._engine.model_field(name).copy_(self.get_default_field(name))
+            getattr(self._model, name).copy_(self.get_default_field(name))
         if self.absent_geoms is not None:
             self._engine.hide_geoms(self.absent_geoms)
             self._expanded.update(COLLISION_MASKS)
@@ -249,17 +367,21 @@ class Simulation:
     def expand_model_fields(self, fields: tuple[str, ...] | list[str]) -> None:
         """Give every environment its own copy of model fields, starting from the shared values.
 
+        Options go by their own name (`gravity`) or as `opt.gravity`.
+
         Do this before anything keeps a reference to `sim.model.<field>`: the tensor is a new one.
 
         Raises:
             ValueError: no such field, or one that the engine cannot hold per environment.
         """
-        new = tuple(name for name in fields if name not in self._expanded)
+        names = (name.removeprefix("opt.") for name in fields)
+        new = tuple(name for name in names if name not in self._expanded)
         for name in new:
             self.get_default_field(name)
         self._engine.expand(new)
         self._expanded.update(new)
         self._model.forget(new)
+        self._options.forget(new)
 
     def recompute_constants(self, level: RecomputeLevel | int, env_ids: EnvIds = None) -> None:
         """Recompute what derives from changed model fields, as `mj_setConst` does.
@@ -359,19 +481,6 @@ class Simulation:
         """
         return self._engine.render(views)
 
-    def render_context(self, views: tuple[CameraView, ...], view: CameraView) -> Any:
-        """Return MuJoCo Warp's context of a view, one of `views` that were rendered together.
-
-        AttributeError on another engine, RuntimeError before the first rendering.
-        """
-        if self.engine_name != "warp":
-            raise AttributeError(
-                f"A render context exists on the warp engine only; this is {self.engine_name}. "
-                "Read images from the camera sensors, which work on both."
-            )
-        engine: Any = self._engine
-        return engine.render_context(views, view)
-
     def jacobian(
         self, points: torch.Tensor, body_ids: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -423,6 +532,13 @@ class Simulation:
         if env_ids.numel() < 2:
             return env_ids.to(self.device, torch.int64)
         return torch.unique(env_ids.to(self.device, torch.int64), sorted=True)
+
+
+def _reshape_rows(field: str, tensor: torch.Tensor) -> torch.Tensor:
+    """View a model field whose rows MuJoCo stores flat as rows of matrices."""
+    shape = _ROW_SHAPES.get(field)
+    is_flat = shape is not None and tensor.shape[-1] == math.prod(shape)
+    return tensor.unflatten(-1, shape) if is_flat else tensor
 
 
 def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:

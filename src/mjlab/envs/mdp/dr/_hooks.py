@@ -71,15 +71,15 @@ def refresh_geom_bounds(selection: Selection) -> None:
     sizes, radii = model_field(env, "geom_size"), model_field(env, "geom_rbound")
     boxes = model_field(env, "geom_aabb")
     types = torch.as_tensor(env.sim.mj_model.geom_type, device=env.device)[selection.columns]
-    new_radii, new_boxes = radii[selection.index], boxes.flatten(2)[selection.index]
+    new_radii, new_boxes = radii[selection.index], boxes[selection.index]
     for kind in types.unique().tolist():
         index = selection.rows[:, None], selection.columns[types == kind][None, :]
         radius, half = _bounds(kind, sizes[index])
         new_radii[:, types == kind] = radius
         # The box is (centre, half sizes); the centre of a primitive does not move.
-        new_boxes[:, types == kind, 3:6] = half
+        new_boxes[:, types == kind, 1] = half
     radii[selection.index] = keep_absent(selection, new_radii, radii)
-    boxes.flatten(2)[selection.index] = keep_absent(selection, new_boxes, boxes.flatten(2))
+    boxes[selection.index] = keep_absent(selection, new_boxes, boxes)
 
 
 def _bounds(kind: int, size: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
