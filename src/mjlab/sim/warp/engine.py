@@ -75,6 +75,8 @@ _RESULTS_ZERO_ON_RESET = (
 )
 # Metres from everything else.
 _NOWHERE = 1e6
+# What follows from `geom_size`, and is per environment only where sizes are.
+_GEOM_BOUNDS = ("geom_rbound", "geom_aabb")
 # A geom that is welded to the world moves only if one of these is changed.
 _STATIC_POSE = frozenset({"body_pos", "body_quat", "geom_pos", "geom_quat"})
 
@@ -122,6 +124,7 @@ class WarpEngine(Engine):
         self._data_tensors: dict[str, torch.Tensor] = {}
         self._model_tensors: dict[str, torch.Tensor] = {}
         self._graphs: dict[str, Any] = {}
+        self._absent: torch.Tensor | None = None
         self._rays: WarpRays | None = None
         self._renderer: WarpRenderer | None = None
         self._eq_active0 = torch.as_tensor(model.eq_active0.astype(bool), device=self.device)
@@ -280,8 +283,9 @@ class WarpEngine(Engine):
             self._graphs.clear()
 
     def hide_geoms(self, absent: torch.Tensor) -> None:
-        self.expand(("geom_rbound", "geom_aabb"))
+        self.expand(_GEOM_BOUNDS)
         hide_geoms(self.wp_model, absent)
+        self._absent = absent
         # For those who read them: Warp itself has one for all environments.
         for name in COLLISION_MASKS:
             mask = torch.as_tensor(getattr(self._host.model, name), device=self.device)
@@ -291,6 +295,8 @@ class WarpEngine(Engine):
         names: tuple[str, ...] = ()
         if level in (1, 3):
             names += FIXED_CONSTANTS
+            if not self._model_tensors.keys().isdisjoint(("geom_size", *_GEOM_BOUNDS)):
+                names += _GEOM_BOUNDS
         if level in (2, 3):
             names += CONSTANTS_AT_QPOS0
         return tuple(name for name in names if getattr(self.wp_model, name).size)
@@ -300,14 +306,15 @@ class WarpEngine(Engine):
             raise ValueError(f"Unknown recompute level {level}; it is one of 1, 2 and 3.")
         written = self.constants_written_by(level)
         self.expand(written)
-        # The solver's scale is no field of MjModel, but it too differs between environments.
-        self.expand(("stat.meaninertia",))
         tensors = [self._model_tensors[name] for name in written]
         with self._only_rows(env_ids, tensors):
             with self._ordered():
                 _RECOMPUTE[level](self.wp_model, self.wp_data)
             if "body_invweight0" in written:
                 self._restore_zero_invweights()
+            # Bounds come from sizes again, which brings back what is hidden by its bounds.
+            if self._absent is not None and "geom_rbound" in written:
+                hide_geoms(self.wp_model, self._absent)
 
     def _restore_zero_invweights(self) -> None:
         """Undo a substitution that MuJoCo does not make.
@@ -497,16 +504,7 @@ class WarpEngine(Engine):
     def state_dict(self) -> dict[str, Any]:
         return {
             "data": {name: self.data_field(name).cpu().clone() for name in _STATE_FIELDS},
-            "model": {
-                name: tensor.cpu().clone()
-                for name, tensor in self._model_tensors.items()
-                if not name.startswith("stat.")
-            },
-            "stat": {
-                name: tensor.cpu().clone()
-                for name, tensor in self._model_tensors.items()
-                if name.startswith("stat.")
-            },
+            "model": {name: tensor.cpu().clone() for name, tensor in self._model_tensors.items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -516,9 +514,8 @@ class WarpEngine(Engine):
                     f"The saved simulation holds {name} as {tuple(value.shape)}, but here it is "
                     f"{tuple(self.data_field(name).shape)}. Resume with the same model and --num-envs."
                 )
-        fields = {**state["model"], **state["stat"]}
-        self.expand(tuple(fields))
-        for name, value in fields.items():
+        self.expand(tuple(state["model"]))
+        for name, value in state["model"].items():
             self._model_tensors[name].copy_(value)
         for name, value in state["data"].items():
             self.data_field(name).copy_(value)

@@ -39,7 +39,7 @@ def find_data_field(data: Any, name: str) -> Any:
 
 
 def find_model_field(model: Any, name: str) -> tuple[Any, str]:
-    """Return the struct (model, its options or statistics) and attribute of a model field.
+    """Return the struct (model or its options) and attribute of a model field.
 
     Options go by their own name or as `opt.<name>`.
 
@@ -47,7 +47,7 @@ def find_model_field(model: Any, name: str) -> tuple[Any, str]:
         ValueError: no such field, or one that cannot differ between environments.
     """
     prefix, _, attribute = name.rpartition(".")
-    structs = {"": (model, model.opt), "opt": (model.opt,), "stat": (model.stat,)}
+    structs = {"": (model, model.opt), "opt": (model.opt,)}
     for struct in structs.get(prefix, ()):
         if attribute in _fields_over(type(struct), "*"):
             return struct, attribute

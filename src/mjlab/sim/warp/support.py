@@ -40,11 +40,6 @@ def _unsupported_options(model: mujoco.MjModel) -> list[str]:
     problems = []
     if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
         problems.append("the solver 'pgs'; use MujocoCfg.solver='newton' or 'cg'")
-    if model.opt.noslip_iterations > 0:
-        problems.append(
-            f"the noslip solver (noslip_iterations={model.opt.noslip_iterations}); set it to 0 and "
-            "raise MujocoCfg.impratio with cone='elliptic' instead"
-        )
     return problems
 
 
