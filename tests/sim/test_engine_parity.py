@@ -10,10 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import mujoco
+import numpy as np
 import pytest
 import torch
 
 from mjlab.sim.config import MujocoCfg, SimulationCfg
+from mjlab.sim.field_lists import ACCELERATION_FIELDS
 from mjlab.sim.simulation import Simulation
 
 from .parity_models import MODELS
@@ -21,6 +23,7 @@ from .parity_models import MODELS
 PARITY_TOLERANCE = 5e-4
 
 NUM_ENVS = 3
+ACC = int(mujoco.mjtStage.mjSTAGE_ACC)
 STATE_FIELDS = (
     "time",
     "qpos",
@@ -242,6 +245,33 @@ def test_a_partial_forward_updates_only_its_environments(pair: Pair) -> None:
         for field, value in before.items():
             assert torch.equal(getattr(sim.data, field)[[0, 2]], value[[0, 2]]), field
     assert_same(pair, pair.derived, rows=[1])
+
+
+@pytest.mark.parametrize("rows", [None, [1]])
+def test_a_forward_to_velocities_keeps_what_the_last_substep_left_of_later_stages(
+    pair: Pair, rows: list[int] | None
+) -> None:
+    set_same_state(pair, seed=3)
+    for sim in pair.both():
+        sim.step(2)
+    copy_state(*pair.both())
+    late = tuple(field for field in pair.derived if field in ACCELERATION_FIELDS)
+    early = tuple(field for field in pair.derived if field not in (*late, "sensordata"))
+    ids = None if rows is None else torch.tensor(rows)
+    for sim in pair.both():
+        before = {field: getattr(sim.data, field).clone() for field in pair.derived}
+        sim.forward(ids, stage="vel")
+        after = {field: getattr(sim.data, field).clone() for field in pair.derived}
+        sim.forward(ids)
+        columns = np.repeat(sim.mj_model.sensor_needstage, sim.mj_model.sensor_dim) == ACC
+        for field in late:
+            assert torch.equal(after[field], before[field]), f"{sim.engine_name} {field}"
+        for field in early:
+            full = getattr(sim.data, field)
+            torch.testing.assert_close(after[field], full, msg=f"{sim.engine_name} {field}")
+        sensors = after["sensordata"]
+        assert torch.equal(sensors[:, columns], before["sensordata"][:, columns])
+        torch.testing.assert_close(sensors[:, ~columns], sim.data.sensordata[:, ~columns])
 
 
 def test_several_steps_in_one_call_are_single_steps(pair: Pair) -> None:

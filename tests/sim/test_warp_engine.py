@@ -17,7 +17,6 @@ from mjlab.sim.engine import EngineUnavailableError
 from mjlab.sim.randomization import expand_model_fields
 from mjlab.sim.sim_data import TorchArray, WarpBridge
 from mjlab.sim.warp.engine import WarpEngine
-from mjlab.sim.warp.support import rotation_matrices
 
 from .parity_models import CARTPOLE, HINGE_CHAIN, LANDING_BOX, MOCAP
 
@@ -124,7 +123,7 @@ def test_an_unknown_model_field_names_close_ones() -> None:
 @pytest.mark.parametrize(
     ("field", "said"),
     [
-        ("contact", "contact sensor"),
+        ("ncon", "sim.data.nacon"),
         ("efc_force", "contact sensor"),
         ("qpso", "Close names: qpos"),
         ("nworld", "no per-environment MjData field"),
@@ -167,6 +166,35 @@ def test_expanded_fields_have_mujocos_shape_and_values() -> None:
     engine.expand(("gravity", "opt.timestep"))
     assert engine.model_field("gravity").shape == (3, 3)
     assert engine.model_field("opt.timestep").tolist() == pytest.approx([0.002] * 3)
+
+
+def test_contacts_of_all_environments_are_tensors() -> None:
+    engine = on_the_floor(make_engine(LANDING_BOX))
+    count, contact = engine.data_field("nacon"), engine.data_field("contact")
+    assert count.shape == (1,)
+    assert count.dtype == torch.int32
+    assert contact.worldid[: int(count)].sort().values.tolist() == [0] * 4 + [1] * 4
+    torch.testing.assert_close(contact.dist[: int(count)], torch.full((8,), -0.001))
+    assert contact.geom.shape == (engine.wp_data.naconmax, 2)
+    assert contact.frame.shape == (engine.wp_data.naconmax, 3, 3)
+
+
+def test_fields_first_read_in_inference_mode_are_written_outside_it() -> None:
+    engine = make_engine(LANDING_BOX)
+    with torch.inference_mode():
+        engine.data_field("qpos")
+        engine.expand(("geom_size",))
+        engine.hide_geoms(torch.zeros(2, 3, dtype=torch.bool))
+        engine.step(1)
+        built = make_engine(LANDING_BOX)
+    built.step(1)
+    engine.data_field("qpos").add_(0.1)
+    for field in ("geom_size", "geom_rbound", "geom_contype"):
+        assert not engine.model_field(field).is_inference()
+    engine.model_field("geom_size").mul_(2.0)
+    engine.reset(torch.tensor([0]))
+    engine.forward(None)
+    engine.load_state_dict(engine.state_dict())
 
 
 def test_expanding_again_keeps_values_and_the_tensor() -> None:
@@ -393,6 +421,33 @@ def test_a_saved_state_continues_bit_for_bit() -> None:
         assert torch.equal(first.data_field(field), second.data_field(field)), field
 
 
+def test_a_saved_state_holds_what_the_last_substep_computed() -> None:
+    engine = on_the_floor(make_engine(LANDING_BOX))
+    qacc, sensors = engine.data_field("qacc"), engine.data_field("sensordata")
+    engine.step(3)
+    engine.forward(None, "vel")
+    second = make_engine(LANDING_BOX)
+    second.load_state_dict(engine.state_dict())
+    assert torch.equal(second.data_field("qacc"), qacc)
+    assert torch.equal(second.data_field("sensordata"), sensors)
+    engine.forward(None)
+    assert not torch.equal(second.data_field("qacc"), qacc)
+
+
+def test_a_forward_leaves_delay_lines_alone() -> None:
+    xml = HINGE_CHAIN.replace(
+        '<jointpos joint="a"/>', '<jointpos joint="a" delay=".01" nsample="4"/>'
+    )
+    engine = make_engine(xml)
+    engine.data_field("qvel").fill_(1.0)
+    engine.step(2)
+    before = engine.data_field("history").clone()
+    engine.data_field("qpos").add_(0.1)
+    for stage in ("pos", "vel", "acc"):
+        engine.forward(None, stage)
+        assert torch.equal(engine.data_field("history"), before)
+
+
 def test_a_saved_state_of_another_size_is_refused() -> None:
     saved = make_engine(CARTPOLE, num_envs=3).state_dict()
     with pytest.raises(ValueError, match="--num-envs"):
@@ -423,14 +478,6 @@ def test_rays_hit_only_the_groups_and_bodies_asked_for() -> None:
     assert (distances == -1).all()
     assert (geoms == -1).all()
     assert not normals.any()
-
-
-def test_rotation_matrices_are_mujocos() -> None:
-    quat = torch.nn.functional.normalize(torch.randn(5, 4, dtype=torch.float64), dim=-1)
-    for row in quat:
-        expected = torch.empty(9, dtype=torch.float64)
-        mujoco.mju_quat2Mat(expected.numpy(), row.numpy())
-        torch.testing.assert_close(rotation_matrices(row), expected.view(3, 3))
 
 
 # Names for packages that hold Warp arrays themselves.

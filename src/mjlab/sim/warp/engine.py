@@ -1,18 +1,22 @@
 """MuJoCo Warp: all environments in one batch of GPU kernels (or, for testing, on the CPU).
 
-Fields are Warp arrays seen through torch without a copy. The substep sequence and the forward pass
-are captured as graphs and replayed, on the CPU as well as on CUDA; nothing in a step waits for the
-GPU.
+Fields are Warp arrays seen through torch without a copy. A substep and each stage of the forward
+pass are captured as graphs and replayed, on the CPU as well as on CUDA; nothing in a step waits for
+the GPU.
 
 The first use on a machine compiles the kernels (minutes); afterwards they come from Warp's cache.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import difflib
+import gc
 import logging
 import os
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -29,6 +33,7 @@ from mjlab.sim.engine import (
     Stage,
 )
 from mjlab.sim.field_lists import (
+    ACCELERATION_FIELDS,
     COLLISION_MASKS,
     CONSTANTS_AT_QPOS0,
     FIXED_CONSTANTS,
@@ -36,18 +41,10 @@ from mjlab.sim.field_lists import (
     ZERO_INPUTS,
 )
 from mjlab.sim.sensor_fed import refuse_without_sensor
-from mjlab.sim.warp.fields import find_data_field, find_model_field
 from mjlab.sim.warp.overflow import OverflowWatch, contacts_per_environment
 from mjlab.sim.warp.rays import WarpRays
 from mjlab.sim.warp.render import WarpRenderer
-from mjlab.sim.warp.support import (
-    UnsupportedByWarpError,
-    mocap_bodies,
-    raycast_problem,
-    refuse_unsupported,
-    rotation_matrices,
-    static_geoms,
-)
+from mjlab.utils.lab_api.math import matrix_from_quat
 
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
@@ -62,6 +59,20 @@ wp: Any = warp
 
 # What the next step depends on. `reset` sets all of it, and a saved state is made of it.
 _STATE_FIELDS = (*INPUTS, "history")
+# Held in another layout than MuJoCo's, or not per environment.
+_UNLIKE_MUJOCO = frozenset({"qLD", "qLDiagInv", "qLU", "solver_niter", "contact", "efc"})
+# What MuJoCo Warp overwrites in a stage beside its results: delay lines, which a substep alone is to
+# advance; forces of the last substep, used as scratch; velocities that constraints read.
+_OVERWRITTEN = {
+    "pos": ("history", "cvel", "cdof_dot"),
+    "vel": ("history", "cacc", "cfrc_int"),
+    "acc": ("history",),
+}
+_STAGES = {
+    "pos": mujoco.mjtStage.mjSTAGE_POS,
+    "vel": mujoco.mjtStage.mjSTAGE_VEL,
+    "acc": mujoco.mjtStage.mjSTAGE_ACC,
+}
 # Results that MuJoCo's reset clears too. Poses and velocities keep their values until `forward`.
 _RESULTS_ZERO_ON_RESET = (
     "qacc",
@@ -77,12 +88,18 @@ _RESULTS_ZERO_ON_RESET = (
 _NOWHERE = 1e6
 # What follows from `geom_size`, and is per environment only where sizes are.
 _GEOM_BOUNDS = ("geom_rbound", "geom_aabb")
+_NO_RAYS = (
+    "MuJoCo Warp cannot cast rays in a model with flexes. Leave out the ray sensors or the flexes, "
+    "or use --engine native (SimulationCfg.engine='native')."
+)
 # A geom that is welded to the world moves only if one of these is changed.
 _STATIC_POSE = frozenset({"body_pos", "body_quat", "geom_pos", "geom_quat"})
 
 _RECOMPUTE = {1: mjwarp.set_const_fixed, 2: mjwarp.set_const_0, 3: mjwarp.set_const}
-# Substeps in one captured graph at most; longer runs replay the graph of a single substep.
-_MAX_CAPTURED_STEPS = 16
+
+
+class UnsupportedByWarpError(EngineUnavailableError, NotImplementedError):
+    """The model or an option needs something that MuJoCo Warp does not have."""
 
 
 def _be_quiet() -> None:
@@ -93,8 +110,13 @@ def _be_quiet() -> None:
 
 
 class WarpEngine(Engine):
-    """MuJoCo Warp on one CUDA device, or on the CPU."""
+    """MuJoCo Warp on one CUDA device, or on the CPU.
 
+    `wp_model`, `wp_data` and `wp_device` are MuJoCo Warp's own, for code that knows it.
+    """
+
+    # What is made here is written into later, in whatever mode torch is then.
+    @torch.inference_mode(False)
     def __init__(
         self, model: mujoco.MjModel, num_envs: int, cfg: SimulationCfg, device: str
     ) -> None:
@@ -108,10 +130,9 @@ class WarpEngine(Engine):
         _be_quiet()
         self.num_envs = num_envs
         self.device = torch.device(device)
-        self._wp_device = _find_device(self.device)
+        self.wp_device = _find_device(self.device)
         self._host = mujoco.MjData(model)
         mujoco.mj_forward(model, self._host)
-        self._sizes = (int(model.nv), int(model.nhistory))
         self._velocity_constraints = bool(
             np.isin(model.eq_type, (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)).any()
         )
@@ -124,16 +145,29 @@ class WarpEngine(Engine):
         self._data_tensors: dict[str, torch.Tensor] = {}
         self._model_tensors: dict[str, torch.Tensor] = {}
         self._graphs: dict[str, Any] = {}
+        self._loaded: set[str] = set()
         self._absent: torch.Tensor | None = None
         self._rays: WarpRays | None = None
         self._renderer: WarpRenderer | None = None
         self._eq_active0 = torch.as_tensor(model.eq_active0.astype(bool), device=self.device)
-        self._mocap_bodies = torch.as_tensor(
-            mocap_bodies(model), dtype=torch.int64, device=self.device
-        )
-        geoms = torch.as_tensor(static_geoms(model), dtype=torch.int64)
-        self._static_geoms = geoms.to(self.device)
-        self._static_bodies = torch.as_tensor(model.geom_bodyid)[geoms].to(self.device).long()
+        mocap = np.flatnonzero(model.body_mocapid >= 0)
+        mocap = mocap[np.argsort(model.body_mocapid[mocap])]
+        self._mocap_bodies = torch.as_tensor(mocap, device=self.device)
+        # Geoms whose world pose MuJoCo Warp computes only once.
+        bodies = model.geom_bodyid
+        is_carried = model.body_mocapid[model.body_rootid[bodies]] >= 0
+        static = np.flatnonzero((model.body_weldid[bodies] == 0) & ~is_carried)
+        self._static_geoms = torch.as_tensor(static, device=self.device)
+        self._static_bodies = torch.as_tensor(bodies[static], device=self.device).long()
+        # Columns of `sensordata` by the stage that computes them.
+        stages = np.repeat(model.sensor_needstage, model.sensor_dim)
+        self._sensor_stages = torch.as_tensor(stages, device=self.device)
+        # Read or not, these have to be kept.
+        self.data_field("sensordata")
+        self.data_field("history")
+        if self.wp_model.sensor_rne_postconstraint:
+            self.data_field("cacc")
+            self.data_field("cfrc_int")
         self._overflow = OverflowWatch(
             as_torch(self.wp_data.overflow),
             {kind.name: int(kind) for kind in mjwarp.OverflowType},
@@ -151,7 +185,7 @@ class WarpEngine(Engine):
                 f"warp (mujoco_warp {mjwarp.__version__}, Warp {wp.config.version}), "
                 f"device {device}" + ("" if self._on_cuda else ", for testing: slow")
             ),
-            raycast_problem=raycast_problem(model),
+            raycast_problem=_NO_RAYS if model.nflex else None,
         )
         self.create_graph()
 
@@ -201,7 +235,7 @@ class WarpEngine(Engine):
 
     @property
     def _on_cuda(self) -> bool:
-        return self._wp_device.is_cuda
+        return self.wp_device.is_cuda
 
     @contextmanager
     def _ordered(self) -> Generator[None]:
@@ -211,14 +245,14 @@ class WarpEngine(Engine):
         order and because a capture is not allowed on torch's default stream. The two streams
         wait for each other on the device; the host waits for neither.
         """
-        with wp.ScopedDevice(self._wp_device):
+        with wp.ScopedDevice(self.wp_device):
             if not self._on_cuda:
                 yield
                 return
             torch_stream = self._torch_stream()
-            self._wp_device.stream.wait_stream(torch_stream)
+            self.wp_device.stream.wait_stream(torch_stream)
             yield
-            torch_stream.wait_stream(self._wp_device.stream)
+            torch_stream.wait_stream(self.wp_device.stream)
 
     def _torch_stream(self) -> Any:
         """Return torch's current stream as Warp sees it; made once for each."""
@@ -227,33 +261,78 @@ class WarpEngine(Engine):
             self._torch_streams[stream.cuda_stream] = wp.stream_from_torch(stream)
         return self._torch_streams[stream.cuda_stream]
 
-    def _launch(self, name: str, work: Callable[[], None]) -> None:
-        """Run `work` by replaying its graph, captured on first use."""
-        with self._ordered():
-            if name not in self._graphs:
-                with wp.ScopedCapture(device=self._wp_device) as capture:
-                    work()
-                self._graphs[name] = capture.graph
-            wp.capture_launch(self._graphs[name])
+    def _launch(self, name: str, work: Callable[[], None], times: int = 1) -> None:
+        """Run `work` some times by replaying its graph.
 
-    def create_graph(self) -> None:
-        """Drop captured graphs; they are captured anew when next needed.
-
-        On CUDA, kernels are loaded first by one step that is undone, because older drivers cannot
+        On CUDA the first run is a plain one that loads the kernels, because older drivers cannot
         load them during a capture.
         """
-        self._graphs.clear()
+        with self._ordered():
+            if self._on_cuda and name not in self._loaded:
+                work()
+                self._loaded.add(name)
+                times -= 1
+            if times and name not in self._graphs:
+                self._graphs[name] = self._capture(work)
+            for _ in range(times):
+                if self._graphs[name] is None:
+                    work()
+                else:
+                    wp.capture_launch(self._graphs[name])
+
+    def _capture(self, work: Callable[[], None]) -> Any:
+        """Return the graph of `work`, or None where capturing is refused."""
+        collects = gc.isenabled()
+        # A collection may free memory of the GPU, which a capture does not survive.
+        gc.disable()
+        try:
+            with wp.ScopedCapture(device=self.wp_device) as capture:
+                work()
+            return capture.graph
+        except RuntimeError as error:
+            if None not in self._graphs.values():
+                logger.warning(
+                    "Warp captures no graph here, so that kernels are launched one by one, which "
+                    "is slower: %s", error,
+                )  # fmt: skip
+            return None
+        finally:
+            if collects:
+                gc.enable()
+
+    @torch.inference_mode(False)
+    def create_graph(self) -> None:
+        """Drop captured graphs. On CUDA capture those of `step` and `forward` at once.
+
+        Elsewhere, and after `expand`, they are captured when next needed.
+        """
+        self._forget_graphs()
         if not self._on_cuda:
             return
         before = {name: self.data_field(name).clone() for name in _STATE_FIELDS}
-        with self._ordered():
-            mjwarp.step(self.wp_model, self.wp_data)
+        # Once plainly, and once captured.
+        for _ in range(2):
+            self._launch("step", self._substep)
+            for stage in _STAGES:
+                self._launch(stage, lambda stage=stage: self._forward(stage))
         for name, value in before.items():
             self.data_field(name).copy_(value)
+        self._launch("acc", lambda: self._forward("acc"))
+        # What overflowed then is no fault of the user's.
+        as_torch(self.wp_data.overflow).zero_()
+
+    def _forget_graphs(self) -> None:
+        self._graphs.clear()
+        self._loaded.clear()
 
     # Fields.
 
-    def data_field(self, name: str) -> torch.Tensor:
+    @torch.inference_mode(False)
+    def data_field(self, name: str) -> Any:
+        if name == "nacon":
+            return as_torch(self.wp_data.nacon)
+        if name == "contact":
+            return _as_tensors(self.wp_data.contact)
         if name not in self._data_tensors:
             array = find_data_field(self.wp_data, name)
             refuse_without_sensor(self._host.model, name)
@@ -271,6 +350,7 @@ class WarpEngine(Engine):
     def is_expanded(self, field: str) -> bool:
         return field in self._model_tensors
 
+    @torch.inference_mode(False)
     def expand(self, fields: tuple[str, ...]) -> None:
         new = [name for name in dict.fromkeys(fields) if name not in self._model_tensors]
         with self._ordered():
@@ -280,8 +360,9 @@ class WarpEngine(Engine):
             self._model_tensors[name] = _like_mujoco(name, getattr(struct, attribute))
         # A graph keeps the addresses of the arrays it was captured with.
         if new and self.num_envs > 1:
-            self._graphs.clear()
+            self._forget_graphs()
 
+    @torch.inference_mode(False)
     def hide_geoms(self, absent: torch.Tensor) -> None:
         self.expand(_GEOM_BOUNDS)
         hide_geoms(self.wp_model, absent)
@@ -306,8 +387,9 @@ class WarpEngine(Engine):
             raise ValueError(f"Unknown recompute level {level}; it is one of 1, 2 and 3.")
         written = self.constants_written_by(level)
         self.expand(written)
-        tensors = [self._model_tensors[name] for name in written]
-        with self._only_rows(env_ids, tensors):
+        others = self._rows_except(env_ids)
+        kept = [(self._model_tensors[name], others) for name in written if others is not None]
+        with _keeping(kept):
             with self._ordered():
                 _RECOMPUTE[level](self.wp_model, self.wp_data)
             if "body_invweight0" in written:
@@ -326,36 +408,22 @@ class WarpEngine(Engine):
         substituted = (weights[..., :1] == weights[..., 1:]) & self._zero_invweight0
         weights.masked_fill_(substituted, 0.0)
 
-    @contextmanager
-    def _only_rows(
-        self, env_ids: torch.Tensor | None, tensors: list[torch.Tensor]
-    ) -> Generator[None]:
-        """Undo what happens within to the rows of other environments."""
+    def _rows_except(self, env_ids: torch.Tensor | None) -> torch.Tensor | None:
+        """Return a mask (N,) of the environments that are not in `env_ids`; None if all are."""
         if env_ids is None:
-            yield
-            return
-        before = [tensor.clone() for tensor in tensors]
-        yield
-        chosen = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        chosen.index_fill_(0, env_ids, True)
-        for tensor, old in zip(tensors, before, strict=True):
-            mask = chosen.view(-1, *[1] * (tensor.dim() - 1))
-            tensor.copy_(torch.where(mask, tensor, old))
+            return None
+        mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        return mask.index_fill_(0, env_ids, False)
 
     # Physics.
 
     def step(self, nstep: int) -> None:
-        if nstep <= _MAX_CAPTURED_STEPS:
-            self._launch(f"step{nstep}", lambda: self._substeps(nstep))
-        else:
-            for _ in range(nstep):
-                self._launch("step1", lambda: self._substeps(1))
+        self._launch("step", self._substep, nstep)
         self._overflow.tick()
 
-    def _substeps(self, nstep: int) -> None:
-        for _ in range(nstep):
-            self._refresh_velocities()
-            mjwarp.step(self.wp_model, self.wp_data)
+    def _substep(self) -> None:
+        self._refresh_velocities()
+        mjwarp.step(self.wp_model, self.wp_data)
 
     def _refresh_velocities(self) -> None:
         """Make `cvel` current where constraints read it before MuJoCo Warp computes it.
@@ -369,30 +437,57 @@ class WarpEngine(Engine):
             mjwarp.com_vel(self.wp_model, self.wp_data)
 
     def forward(self, env_ids: torch.Tensor | None, stage: Stage = "acc") -> None:
-        # Warp computes all environments; those not asked for get their values back, so that
-        # derived fields of theirs that are one substep old stay so, as on the native engine.
-        results = [
-            tensor for name, tensor in self._data_tensors.items() if name not in _STATE_FIELDS
-        ]
-        with self._only_rows(env_ids, results):
+        # Warp computes all environments and uses fields of later stages as scratch; what was not
+        # asked for gets its values back. Fields that are one substep old stay so, as on native.
+        others = self._rows_except(env_ids)
+        kept: list[tuple[torch.Tensor, torch.Tensor | None]] = []
+        for name, tensor in self._data_tensors.items():
+            if name == "sensordata":
+                late = (self._sensor_stages > int(_STAGES[stage]))[None]
+                kept.append((tensor, late if others is None else late | others[:, None]))
+            elif name in _OVERWRITTEN[stage]:
+                kept.append((tensor, None))
+            elif others is not None and name not in _STATE_FIELDS:
+                kept.append((tensor, others))
+        with _keeping(kept):
             if len(self._static_geoms) and not _STATIC_POSE.isdisjoint(self._model_tensors):
                 self._place_static_geoms()
-            self._launch("forward", self._forward)
+            self._launch(stage, lambda: self._forward(stage))
 
-    def _forward(self) -> None:
+    def _forward(self, stage: str) -> None:
+        """Compute stages up to `stage` in all environments, overwriting fields of later ones."""
+        model, data = self.wp_model, self.wp_data
         self._refresh_velocities()
-        mjwarp.forward(self.wp_model, self.wp_data)
+        if stage == "acc":
+            mjwarp.forward(model, data)
+            return
+        mjwarp.fwd_position(model, data, factorize=False)
+        # Sensors write nothing where there is nothing to measure, like a limit that is far away.
+        data.sensordata.zero_()
+        mjwarp.sensor_pos(model, data)
+        has_energy = model.opt.enableflags & mjwarp.EnableBit.ENERGY
+        if has_energy:
+            mjwarp.energy_pos(model, data)
+        if stage == "vel":
+            mjwarp.fwd_velocity(model, data)
+            mjwarp.sensor_vel(model, data)
+            if has_energy:
+                mjwarp.energy_vel(model, data)
 
     def _place_static_geoms(self) -> None:
         """Compute the poses of geoms that are welded to the world, which Warp does only once."""
         self._launch("kinematics", lambda: mjwarp.kinematics(self.wp_model, self.wp_data))
         geoms, bodies = self._static_geoms, self._static_bodies
-        positions = as_torch(self.wp_model.geom_pos)[:, geoms, :, None]
-        rotations = rotation_matrices(as_torch(self.wp_model.geom_quat)[:, geoms])
         frames = self.data_field("xmat")[:, bodies]
-        origins = self.data_field("xpos")[:, bodies]
-        self.data_field("geom_xpos")[:, geoms] = origins + (frames @ positions).squeeze(-1)
-        self.data_field("geom_xmat")[:, geoms] = frames @ rotations
+        positions = as_torch(self.wp_model.geom_pos)[:, geoms]
+        rotations = matrix_from_quat(as_torch(self.wp_model.geom_quat)[:, geoms])
+        # Sums, because products of matrices may be rounded to TF32.
+        self.data_field("geom_xpos")[:, geoms] = self.data_field("xpos")[:, bodies] + (
+            frames * positions[..., None, :]
+        ).sum(dim=-1)
+        self.data_field("geom_xmat")[:, geoms] = (
+            frames[..., None] * rotations[..., None, :, :]
+        ).sum(dim=-2)
 
     def reset(self, env_ids: torch.Tensor | None) -> None:
         # `mjwarp.reset_data` clears the contacts of all environments together with those of the
@@ -405,15 +500,11 @@ class WarpEngine(Engine):
         for name, source in (("mocap_pos", "body_pos"), ("mocap_quat", "body_quat")):
             poses = as_torch(getattr(self.wp_model, source))
             _set_rows(self.data_field(name), env_ids, poses[:, self._mocap_bodies])
-        if self._sizes[1]:
-            self._reset_history(env_ids)
-
-    def _reset_history(self, env_ids: torch.Tensor | None) -> None:
-        mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        if env_ids is not None:
-            mask.zero_().index_fill_(0, env_ids, True)
-        with self._ordered():
-            mjwarp.reset_history(self.wp_model, self.wp_data, reset=wp.from_torch(mask))
+        if self._host.model.nhistory:
+            mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+            mask.fill_(True) if env_ids is None else mask.index_fill_(0, env_ids, True)
+            with self._ordered():
+                mjwarp.reset_history(self.wp_model, self.wp_data, reset=wp.from_torch(mask))
 
     def check_overflow(self) -> None:
         """Log now, once a kind, what exceeded its capacity so far. Waits for the GPU."""
@@ -475,7 +566,7 @@ class WarpEngine(Engine):
     def jacobian(
         self, points: torch.Tensor, body_ids: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        shape = (self.num_envs, 3, self._sizes[0])
+        shape = (self.num_envs, 3, self._host.model.nv)
         translational = torch.empty(shape, device=self.device)
         rotational = torch.empty(shape, device=self.device)
         # Copied before Warp's stream starts to wait for torch's, which it does only once.
@@ -504,6 +595,12 @@ class WarpEngine(Engine):
     def state_dict(self) -> dict[str, Any]:
         return {
             "data": {name: self.data_field(name).cpu().clone() for name in _STATE_FIELDS},
+            # No forward pass gives these as the last substep did.
+            "results": {
+                name: tensor.cpu().clone()
+                for name, tensor in self._data_tensors.items()
+                if name in ACCELERATION_FIELDS or name == "sensordata"
+            },
             "model": {name: tensor.cpu().clone() for name, tensor in self._model_tensors.items()},
         }
 
@@ -519,12 +616,58 @@ class WarpEngine(Engine):
             self._model_tensors[name].copy_(value)
         for name, value in state["data"].items():
             self.data_field(name).copy_(value)
-        self.forward(None)
+        # Earlier releases saved no results.
+        results = state.get("results", {})
+        self.forward(None, "vel" if results else "acc")
+        for name, value in results.items():
+            self.data_field(name).copy_(value)
+
+
+def refuse_unsupported(model: mujoco.MjModel) -> None:
+    """Raise if options of the model are unknown to MuJoCo Warp, naming each and what to change.
+
+    Raises:
+        UnsupportedByWarpError: with everything that is unsupported, not only the first.
+    """
+    problems = []
+    if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
+        problems.append("the solver 'pgs'; use MujocoCfg.solver='newton' or 'cg'")
+    known: dict[str, Any] = {"disable": mjwarp.DisableBit, "enable": mjwarp.EnableBit}
+    bits = {"disable": mujoco.mjtDisableBit, "enable": mujoco.mjtEnableBit}
+    for kind, supported in known.items():
+        flags = getattr(model.opt, f"{kind}flags")
+        # Which environments sleep is no part of the state that is reset and saved here.
+        supported = {int(bit) for bit in supported if bit.name != "SLEEP"}
+        problems += [
+            f"the {kind} flag {name[7:].lower()!r}; leave it out of MujocoCfg.{kind}flags and of "
+            "the XML"
+            for name, bit in bits[kind].__members__.items()
+            if not name.startswith("mjN") and flags & int(bit) and int(bit) not in supported
+        ]
+    if problems:
+        raise UnsupportedByWarpError(
+            "The warp engine cannot simulate this model:\n"
+            + "\n".join(f"  - {problem}" for problem in problems)
+            + "\nOr use --engine native (SimulationCfg.engine='native'), which supports all of it."
+        )
+
+
+@contextmanager
+def _keeping(kept: list[tuple[torch.Tensor, torch.Tensor | None]]) -> Generator[None]:
+    """Undo what happens within where a mask over the first dimensions is true (None: everywhere)."""
+    before = [tensor.clone() for tensor, _ in kept]
+    yield
+    for (tensor, mask), old in zip(kept, before, strict=True):
+        if mask is not None:
+            mask = mask.view(*mask.shape, *[1] * (tensor.dim() - mask.dim()))
+            old = torch.where(mask, old, tensor)
+        tensor.copy_(old)
 
 
 # Warp's structs.
 
 
+@torch.inference_mode(False)
 def as_torch(array: Any) -> torch.Tensor:
     """View a Warp array as a torch tensor that shares its memory; vectors become last dimensions."""
     if array.size == 0:
@@ -533,6 +676,76 @@ def as_torch(array: Any) -> torch.Tensor:
         device = wp.device_to_torch(array.device)
         return torch.empty((*array.shape, *inner), dtype=scalar, device=device)
     return wp.to_torch(array)
+
+
+def _as_tensors(struct: Any) -> SimpleNamespace:
+    """View the arrays of a Warp struct as torch tensors."""
+    return SimpleNamespace(
+        **{
+            field.name: as_torch(getattr(struct, field.name))
+            for field in dataclasses.fields(struct)
+        }
+    )
+
+
+def find_data_field(data: Any, name: str) -> Any:
+    """Return the Warp array of an `MjData` field that every environment has.
+
+    Raises:
+        AttributeError: there is no such field; the message says what to use, or close names.
+    """
+    known = {
+        field
+        for field in _fields_over(type(data), "nworld") - _UNLIKE_MUJOCO
+        if hasattr(mujoco.MjData, field)
+    }
+    if name in known:
+        return getattr(data, name)
+    if name == "ncon" or name.startswith("efc"):
+        raise AttributeError(
+            f"The warp engine does not offer MjData.{name}; read contacts by a contact sensor, or "
+            "those of all environments together from sim.data.nacon and sim.data.contact."
+        )
+    raise AttributeError(
+        f"The warp engine has no per-environment MjData field {name!r}." + _hint(name, known)
+    )
+
+
+def find_model_field(model: Any, name: str) -> tuple[Any, str]:
+    """Return the struct (model or its options) and attribute of a model field.
+
+    Options go by their own name or as `opt.<name>`.
+
+    Raises:
+        ValueError: no such field, or one that cannot differ between environments.
+    """
+    prefix, _, attribute = name.rpartition(".")
+    structs = {"": (model, model.opt), "opt": (model.opt,)}
+    for struct in structs.get(prefix, ()):
+        if attribute in _fields_over(type(struct), "*"):
+            return struct, attribute
+    if hasattr(mujoco.MjModel, attribute) or hasattr(mujoco.MjOption, attribute):
+        raise ValueError(
+            f"MuJoCo Warp shares model field {name!r} between all environments; it cannot differ. "
+            "Set it in the model instead, or use --engine native."
+        )
+    raise ValueError(
+        f"MjModel has no field {name!r}." + _hint(name, _fields_over(type(model), "*"))
+    )
+
+
+def _fields_over(struct: type[Any], dimension: str) -> set[str]:
+    """Return the names of a struct's array fields whose first dimension is `dimension`."""
+    return {
+        field.name
+        for field in dataclasses.fields(struct)
+        if (getattr(field.type, "shape", None) or (None,))[0] == dimension
+    }
+
+
+def _hint(name: str, known: set[str]) -> str:
+    close = difflib.get_close_matches(name, sorted(known), n=3)
+    return f" Close names: {', '.join(close)}." if close else ""
 
 
 def expand_arrays(model: Any, nworld: int, names: list[str]) -> None:
