@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from contextlib import contextmanager
 import mujoco
 import pytest
 import torch
+import warp as wp
 from torch.overrides import TorchFunctionMode
 
 from mjlab.sim.config import MujocoCfg, SimulationCfg
@@ -525,8 +527,6 @@ def test_importing_the_compatibility_names_loads_no_warp() -> None:
 def test_warp_is_quiet_unless_asked_otherwise(
     wish: str | None, quiet: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import warp as wp
-
     from mjlab.sim.warp.engine import _be_quiet
 
     monkeypatch.setattr(wp.config, "log_level", wp.LOG_INFO)
@@ -598,6 +598,84 @@ def test_torch_computes_nothing_that_warp_reads_within_the_same_wait() -> None:
         engine.recompute_constants(3, torch.tensor([0]))
     # What `expand` copies is queued on Warp's stream.
     assert set(work.found) <= {"copy_"}
+
+
+# What differs on CUDA, with an engine on the CPU that takes itself for one on CUDA.
+
+
+@pytest.fixture
+def as_on_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
+    @contextmanager
+    def ordered(self):
+        with wp.ScopedDevice(self.wp_device):
+            yield
+
+    monkeypatch.setattr(WarpEngine, "_on_cuda", True)
+    monkeypatch.setattr(WarpEngine, "_ordered", ordered)
+
+
+def test_graphs_are_captured_at_construction_without_a_trace(
+    as_on_cuda: None, caplog: pytest.LogCaptureFixture
+) -> None:
+    # The box lies on the floor, with more contacts than there is room for.
+    engine = make_engine(LANDING_BOX.replace('pos="0 0 .4"', 'pos="0 0 .04"'), nconmax=1)
+    caplog.clear()
+    assert engine._graphs.keys() == {"step", "pos", "vel", "acc"}
+    assert not engine.data_field("time").any()
+    assert engine.data_field("qpos").tolist() == [pytest.approx([0, 0, 0.04, 1, 0, 0, 0])] * 2
+    torch.testing.assert_close(engine.data_field("xpos")[:, 1], engine.data_field("qpos")[:, :3])
+    engine.data_field("qpos")[:, 2] = 1.0
+    engine.step(2)
+    engine.check_overflow()
+    assert not caplog.records
+
+
+def test_kernels_are_loaded_before_a_capture_which_no_collection_disturbs(
+    as_on_cuda: None,
+) -> None:
+    engine = make_engine(LANDING_BOX)
+    collects: list[bool] = []
+
+    def work() -> None:
+        collects.append(gc.isenabled())
+
+    engine.launch("probe", work)
+    engine.launch("probe", work, times=2)
+    assert collects == [True, False]
+    assert gc.isenabled()
+    # Expanded fields may need other kernels.
+    engine.expand(("body_mass",))
+    engine.launch("probe", work, times=3)
+    assert collects == [True, False] * 2
+
+
+def test_rays_replay_one_graph_for_all_sensors(as_on_cuda: None) -> None:
+    engine = make_engine(LANDING_BOX)
+    captured = engine._graphs.keys() - {"step", "pos", "vel", "acc"}
+    down = torch.tensor([0.0, 0.0, -1.0]).expand(2, 3, 3)
+    start = torch.tensor([-0.05, 0.1, 2.0]).expand(2, 3, 3)
+    first = engine.raycast(start, down, None, None)
+    engine.raycast(start, down, None, torch.tensor([-1, -1, 1]))
+    captured = engine._graphs.keys() - {"step", "pos", "vel", "acc"}
+    assert len(captured) == 1
+    torch.testing.assert_close(first[0], torch.full((2, 3), 1.55))
+
+
+def test_where_capturing_is_refused_kernels_are_launched_one_by_one(
+    as_on_cuda: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Refused:
+        def __init__(self, **_: object) -> None:
+            raise RuntimeError("no capture")
+
+    replayed = make_engine(LANDING_BOX)
+    monkeypatch.setattr(wp, "ScopedCapture", Refused)
+    plain = make_engine(LANDING_BOX)
+    assert [record.getMessage() for record in caplog.records if "no capture" in record.message]
+    assert len(caplog.records) == 1
+    for engine in (replayed, plain):
+        on_the_floor(engine).step(5)
+    assert torch.equal(replayed.data_field("qpos"), plain.data_field("qpos"))
 
 
 # On a GPU, the captured graphs. These do not run where there is none.

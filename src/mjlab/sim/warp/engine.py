@@ -261,17 +261,21 @@ class WarpEngine(Engine):
             self._torch_streams[stream.cuda_stream] = wp.stream_from_torch(stream)
         return self._torch_streams[stream.cuda_stream]
 
-    def _launch(self, name: str, work: Callable[[], None], times: int = 1) -> None:
+    def launch(
+        self, name: str, work: Callable[[], None], times: int = 1, on_cpu: bool = True
+    ) -> None:
         """Run `work` some times by replaying its graph.
 
         On CUDA the first run is a plain one that loads the kernels, because older drivers cannot
-        load them during a capture.
+        load them during a capture. All runs on the CPU are plain without `on_cpu`, for work that a
+        capture does not record there: filling arrays, and refitting trees.
         """
         with self._ordered():
-            if self._on_cuda and name not in self._loaded:
+            if name not in self._loaded and (self._on_cuda or not on_cpu):
                 work()
-                self._loaded.add(name)
                 times -= 1
+                if self._on_cuda:
+                    self._loaded.add(name)
             if times and name not in self._graphs:
                 self._graphs[name] = self._capture(work)
             for _ in range(times):
@@ -312,12 +316,12 @@ class WarpEngine(Engine):
         before = {name: self.data_field(name).clone() for name in _STATE_FIELDS}
         # Once plainly, and once captured.
         for _ in range(2):
-            self._launch("step", self._substep)
+            self.launch("step", self._substep)
             for stage in _STAGES:
-                self._launch(stage, lambda stage=stage: self._forward(stage))
+                self.launch(stage, lambda stage=stage: self._forward(stage))
         for name, value in before.items():
             self.data_field(name).copy_(value)
-        self._launch("acc", lambda: self._forward("acc"))
+        self.launch("acc", lambda: self._forward("acc"))
         # What overflowed then is no fault of the user's.
         as_torch(self.wp_data.overflow).zero_()
 
@@ -418,7 +422,7 @@ class WarpEngine(Engine):
     # Physics.
 
     def step(self, nstep: int) -> None:
-        self._launch("step", self._substep, nstep)
+        self.launch("step", self._substep, nstep)
         self._overflow.tick()
 
     def _substep(self) -> None:
@@ -452,7 +456,7 @@ class WarpEngine(Engine):
         with _keeping(kept):
             if len(self._static_geoms) and not _STATIC_POSE.isdisjoint(self._model_tensors):
                 self._place_static_geoms()
-            self._launch(stage, lambda: self._forward(stage))
+            self.launch(stage, lambda: self._forward(stage))
 
     def _forward(self, stage: str) -> None:
         """Compute stages up to `stage` in all environments, overwriting fields of later ones."""
@@ -476,7 +480,7 @@ class WarpEngine(Engine):
 
     def _place_static_geoms(self) -> None:
         """Compute the poses of geoms that are welded to the world, which Warp does only once."""
-        self._launch("kinematics", lambda: mjwarp.kinematics(self.wp_model, self.wp_data))
+        self.launch("kinematics", lambda: mjwarp.kinematics(self.wp_model, self.wp_data))
         geoms, bodies = self._static_geoms, self._static_bodies
         frames = self.data_field("xmat")[:, bodies]
         positions = as_torch(self.wp_model.geom_pos)[:, geoms]
@@ -539,21 +543,23 @@ class WarpEngine(Engine):
         if self.capabilities.raycast_problem is not None:
             raise UnsupportedByWarpError(self.capabilities.raycast_problem)
         if self._rays is None:
-            self._rays = WarpRays(self._host.model, self.wp_model, self.wp_data, self._ordered)
+            self._rays = WarpRays(self._host.model, self.wp_model, self.wp_data, self.launch)
         distances, normals, geom_ids = self._rays.cast(
             origins, directions, geom_groups, exclude_body_ids
         )
+        missed = distances < 0.0
         if max_distances is not None:
-            missed = distances > max_distances
-            distances.masked_fill_(missed, -1.0)
-            normals.masked_fill_(missed[..., None], 0.0)
-            geom_ids.masked_fill_(missed, -1)
-        return distances, normals, geom_ids
+            missed = missed | (distances > max_distances)
+        return (
+            distances.masked_fill(missed, -1.0),
+            normals.masked_fill(missed[..., None], 0.0),
+            geom_ids.masked_fill(missed, -1),
+        )
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:
         if self._renderer is None:
             self._renderer = WarpRenderer(
-                self._host.model, self.wp_model, self.wp_data, self._ordered, self._launch
+                self._host.model, self.wp_model, self.wp_data, self._ordered, self.launch
             )
         return self._renderer.render(views, self._model_tensors.keys())
 
@@ -567,10 +573,10 @@ class WarpEngine(Engine):
         self, points: torch.Tensor, body_ids: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         shape = (self.num_envs, 3, self._host.model.nv)
-        translational = torch.empty(shape, device=self.device)
-        rotational = torch.empty(shape, device=self.device)
+        translational = torch.empty(shape, dtype=torch.float32, device=self.device)
+        rotational = torch.empty_like(translational)
         # Copied before Warp's stream starts to wait for torch's, which it does only once.
-        points, body_ids = points.contiguous(), body_ids.to(torch.int32).contiguous()
+        points, body_ids = points.float().contiguous(), body_ids.to(torch.int32).contiguous()
         with self._ordered():
             mjwarp.jac(
                 self.wp_model,
@@ -632,6 +638,14 @@ def refuse_unsupported(model: mujoco.MjModel) -> None:
     problems = []
     if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
         problems.append("the solver 'pgs'; use MujocoCfg.solver='newton' or 'cg'")
+    for element, kind, instead in (
+        ("pid", mujoco.mjtGain.mjGAIN_PID, "<position> or BuiltinPdActuatorCfg"),
+        ("orientation", mujoco.mjtGain.mjGAIN_SO3, "one <position> for each hinge"),
+    ):
+        ids = np.flatnonzero(model.actuator_gaintype == kind)
+        if len(ids):
+            names = [model.actuator(i).name or f"(id {i})" for i in ids]
+            problems.append(f"the <{element}> actuators {names}; use {instead} instead")
     known: dict[str, Any] = {"disable": mjwarp.DisableBit, "enable": mjwarp.EnableBit}
     bits = {"disable": mujoco.mjtDisableBit, "enable": mujoco.mjtEnableBit}
     for kind, supported in known.items():

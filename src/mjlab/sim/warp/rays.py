@@ -1,9 +1,13 @@
-"""Casting rays on the Warp engine, with a tree of bounding boxes over the geoms of each world."""
+"""Rays on the Warp engine, cast through a tree of bounding boxes over the geoms of each world.
+
+MuJoCo Warp's rays through its render context pass the inside of meshes and height fields, and see
+of a height field the top alone, which is what `Engine.raycast` promises. Its rays without one do
+not, and try every geom for every ray.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from typing import Any
 
 import mujoco
@@ -18,26 +22,17 @@ wp: Any = warp
 
 
 class WarpRays:
-    """Casts the rays of a Warp engine.
-
-    MuJoCo Warp's rays through its render context pass the inside of meshes and height fields, and
-    see of a height field the top alone, which is what `Engine.raycast` promises. Its rays without
-    one do not, and try every geom for every ray.
-    """
+    """Rays of one Warp engine. Each number of rays into some geom groups is one graph."""
 
     def __init__(
-        self,
-        host: mujoco.MjModel,
-        model: Any,
-        data: Any,
-        ordered: Callable[[], AbstractContextManager[None]],
+        self, host: mujoco.MjModel, model: Any, data: Any, launch: Callable[..., None]
     ) -> None:
-        """Cast in the worlds of `data`.
+        """Cast in the worlds of `data`; `host` is the model on the host.
 
-        `host` is the model on the host; Warp's work is done within `ordered()`, and torch's is not.
+        `launch` is `WarpEngine.launch`.
         """
-        self._host, self._model, self._data, self._ordered = host, model, data, ordered
-        self._contexts: dict[tuple[int, ...] | None, Any] = {}
+        self._host, self._model, self._data, self._launch = host, model, data, launch
+        self._queries: dict[Any, _Query] = {}
 
     def cast(
         self,
@@ -46,54 +41,66 @@ class WarpRays:
         geom_groups: tuple[int, ...] | None,
         exclude_body_ids: torch.Tensor | None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return distances (N, R), normals (N, R, 3) and geom ids (N, R) at the current poses."""
-        shape, device = tuple(origins.shape[:2]), origins.device
-        distances = torch.full(shape, -1.0, device=device)
-        normals = torch.zeros((*shape, 3), device=device)
-        geom_ids = torch.full(shape, -1, dtype=torch.int32, device=device)
-        if exclude_body_ids is None:
-            exclude_body_ids = torch.full(shape[1:], -1, device=device)
-        excluded = exclude_body_ids.to(torch.int32).contiguous()
-        origins, directions = origins.contiguous(), directions.contiguous()
-        with self._ordered():
-            context = self._context(geom_groups)
-            if context is None:
-                return distances, normals, geom_ids
-            mjwarp.refit_bvh(self._model, self._data, context)
-            mjwarp.rays(
-                self._model,
-                self._data,
-                wp.from_torch(origins, dtype=wp.vec3),
-                wp.from_torch(directions, dtype=wp.vec3),
-                # The context holds the geoms of these groups and no others.
-                wp.types.vector(length=6, dtype=float)(*[-1.0] * 6),
-                True,
-                wp.from_torch(excluded),
-                wp.from_torch(distances),
-                wp.from_torch(geom_ids),
-                wp.from_torch(normals, dtype=wp.vec3),
-                context,
-            )
-        return distances, normals, geom_ids
+        """Return distances (N, R), normals (N, R, 3) and geom ids (N, R) at the current poses.
 
-    def _context(self, groups: tuple[int, ...] | None) -> Any:
-        """Return the render context of some groups, made on first use; None if nothing is in it."""
-        key = None if groups is None else tuple(sorted(set(groups)))
-        if key not in self._contexts:
-            self._contexts[key] = self._make_context(key)
-        return self._contexts[key]
-
-    def _make_context(self, groups: tuple[int, ...] | None) -> Any:
+        They are overwritten by the next call with as many rays into the same groups.
+        """
         # MuJoCo counts a group beyond 0 to 5 as the nearest of these.
         present = np.unique(self._host.geom_group)
-        if groups is not None:
-            present = present[np.isin(present.clip(0, 5), groups)]
-        if not len(present):
-            return None
-        return mjwarp.create_render_context(
-            self._host,
-            self._data.nworld,
-            cam_active=[],
-            use_textures=False,
-            enabled_geom_groups=present.tolist(),
+        if geom_groups is not None:
+            present = present[np.isin(present.clip(0, 5), geom_groups)]
+        groups = tuple(present.tolist())
+        key = (groups, origins.shape[1])
+        if key not in self._queries:
+            self._queries[key] = _Query(*origins.shape[:2], origins.device)
+        query = self._queries[key]
+        query.origins.copy_(origins)
+        query.directions.copy_(directions)
+        if exclude_body_ids is None:
+            query.excluded.fill_(-1)
+        else:
+            query.excluded.copy_(exclude_body_ids)
+        if groups:
+            self._launch(f"rays {key}", lambda: self._run(query, groups), on_cpu=False)
+        return query.distances, query.normals, query.geom_ids
+
+    def _run(self, query: _Query, groups: tuple[int, ...]) -> None:
+        if query.context is None:
+            query.context = mjwarp.create_render_context(
+                self._host,
+                self._data.nworld,
+                cam_active=[],
+                use_textures=False,
+                enabled_geom_groups=list(groups),
+            )
+        mjwarp.refit_bvh(self._model, self._data, query.context)
+        mjwarp.rays(
+            self._model,
+            self._data,
+            wp.from_torch(query.origins, dtype=wp.vec3),
+            wp.from_torch(query.directions, dtype=wp.vec3),
+            # The context holds the geoms of these groups and no others.
+            wp.types.vector(length=6, dtype=float)(*[-1.0] * 6),
+            True,
+            wp.from_torch(query.excluded),
+            wp.from_torch(query.distances),
+            wp.from_torch(query.geom_ids),
+            wp.from_torch(query.normals, dtype=wp.vec3),
+            query.context,
         )
+
+
+class _Query:
+    """Memory of R rays in each of N worlds, at the addresses that a graph was captured with."""
+
+    @torch.inference_mode(False)
+    def __init__(self, num_worlds: int, num_rays: int, device: torch.device) -> None:
+        shape, real = (num_worlds, num_rays), {"dtype": torch.float32, "device": device}
+        whole = {"dtype": torch.int32, "device": device}
+        self.origins = torch.zeros(*shape, 3, **real)
+        self.directions = torch.zeros(*shape, 3, **real)
+        self.excluded = torch.zeros(num_rays, **whole)
+        self.distances = torch.full(shape, -1.0, **real)
+        self.normals = torch.zeros(*shape, 3, **real)
+        self.geom_ids = torch.full(shape, -1, **whole)
+        self.context: Any = None

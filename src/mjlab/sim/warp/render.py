@@ -25,9 +25,6 @@ wp: Any = warp
 _CONTEXT_FIELDS = LENS_FIELDS | {"light_attenuation", "light_type", "geom_dataid"}
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 
-Launch = Callable[[str, Callable[[], None]], None]
-"""Runs work by replaying its graph."""
-
 
 class WarpRenderer:
     """Renders the views of a Warp engine.
@@ -42,11 +39,12 @@ class WarpRenderer:
         model: Any,
         data: Any,
         ordered: Callable[[], AbstractContextManager[None]],
-        launch: Launch,
+        launch: Callable[..., None],
     ) -> None:
         """Render the worlds of `data`.
 
-        `host` is the model on the host; Warp's work is done within `ordered()`, or by `launch`.
+        `host` is the model on the host; Warp's work is done within `ordered()`, or by `launch`,
+        which is `WarpEngine.launch`.
         """
         self._host, self._model, self._data = host, model, data
         self._ordered, self._launch = ordered, launch
@@ -108,12 +106,11 @@ class _Scene:
         views: dict[int, CameraView],
         expanded: frozenset[str],
         ordered: Callable[[], AbstractContextManager[None]],
-        launch: Launch,
+        launch: Callable[..., None],
         name: str,
     ) -> None:
         self.views, self.expanded = views, expanded
         self._ordered, self._launch, self._name = ordered, launch, name
-        self._is_loaded = False
         members = list(views.values())
         first = members[0]
         # MuJoCo counts a group beyond 0 to 5 as the nearest of these.
@@ -193,14 +190,7 @@ class _Scene:
             mjwarp.refit_bvh(model, data, self.context)
             mjwarp.render(model, data, self.context)
 
-        if self._is_loaded and data.qpos.device.is_cuda:
-            self._launch(self._name, work)
-        else:
-            # Kernels are loaded by the first call, because older drivers cannot load them during a
-            # capture; and on the CPU a capture leaves out what fills arrays.
-            with self._ordered():
-                work()
-            self._is_loaded = True
+        self._launch(self._name, work, on_cpu=False)
         for parts, rgb in self._packed:
             for channel in range(3):
                 rgb[..., channel] = parts[..., 2 - channel]
