@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from mjlab.utils.torch import configure_torch_backends
+from mjlab.utils.torch import configure_torch_backends, prepare_torch
 
 backends: Any = torch.backends
 
@@ -33,3 +33,12 @@ def test_benchmarking_is_the_opposite_of_determinism(deterministic):
     configure_torch_backends(deterministic=deterministic)
     assert backends.cudnn.deterministic is deterministic
     assert backends.cudnn.benchmark is not deterministic
+
+
+def test_a_process_has_its_own_gpu_as_the_current_one(monkeypatch):
+    chosen = []
+    monkeypatch.setattr(torch.cuda, "set_device", chosen.append)
+    prepare_torch("cpu")
+    prepare_torch("cuda:1")
+    assert chosen == [torch.device("cuda:1")]
+    assert backends.cuda.matmul.fp32_precision == "tf32"

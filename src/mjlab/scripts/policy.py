@@ -248,7 +248,9 @@ def make_env(
     """
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.rl import RslRlVecEnvWrapper
+    from mjlab.utils.torch import prepare_torch
 
+    prepare_torch(device)
     cfg = copy.deepcopy(cfg)
     cfg.seed = cfg.seed if seed is None else seed
     if num_envs is not None:

@@ -115,10 +115,12 @@ def launch_training(task: str, cfg: TrainConfig) -> Path:
             cannot be done; raised before training starts wherever that can be known.
     """
     from mjlab.rl.distributed import joined_processes, same_fate
+    from mjlab.utils.torch import prepare_torch
 
     rank = process_rank()
     with output_of(rank) as output:
         device = training_device(cfg, rank)
+        prepare_torch(device)
         with joined_processes(device):
             with same_fate():
                 check_flags(cfg)

@@ -7,6 +7,14 @@ from typing import Any
 import torch
 
 
+def prepare_torch(device: str) -> None:
+    """Configure torch for a process that trains or plays on `device`: its current GPU, and TF32."""
+    configure_torch_backends()
+    if torch.device(device).type == "cuda":
+        # Events, and streams that are asked for without a device, are otherwise those of cuda:0.
+        torch.cuda.set_device(torch.device(device))
+
+
 def configure_torch_backends(allow_tf32: bool = True, deterministic: bool = False) -> None:
     """Set precision and determinism of GPU kernels.
 
