@@ -54,6 +54,11 @@ _FACTORIES = (
     )
     | _FROM_HOST
 )
+# On a GPU, TF32 may round what goes into these to ten bits: 8 mm at 10 m from the origin.
+_ROUNDED = frozenset(
+    {"matmul", "__matmul__", "__rmatmul__", "mm", "bmm", "mv", "einsum", "addmm", "baddbmm"}
+    | {"addmv", "addbmm", "tensordot", "inner", "cdist"}
+)
 # These take tensors of both devices.
 _CROSSING = frozenset(
     {"copy_", "tensor", "as_tensor", "asarray", "_has_compatible_shallow_copy_type"}
@@ -108,6 +113,8 @@ class PretendCuda(TorchFunctionMode):
         super().__init__()
         self.waits: Counter[str] = Counter()
         """Number of host synchronizations by `file:line function` of the innermost line of mjlab."""
+        self.rounded: Counter[str] = Counter()
+        """Number of matrix products in single precision, which TF32 may round; likewise."""
         self._is_paused = False
 
     @contextlib.contextmanager
@@ -144,6 +151,8 @@ class PretendCuda(TorchFunctionMode):
         if "device" in kwargs:
             return self._make(name, func, args, kwargs)
         marked, others = self._check(name, func, args, kwargs)
+        if marked and name in _ROUNDED and next(_tensors([args])).dtype == torch.float32:
+            self.rounded[f"{self._place()}: {name}"] += 1
         self._count_waits(name, args, marked, bool(kwargs.get("non_blocking")))
         result = func(*args, **kwargs)
         if name in ("tensor", "copy_") or (name in _FACTORIES and not is_marked(args and args[0])):
@@ -229,7 +238,12 @@ class PretendCuda(TorchFunctionMode):
         crosses = name == "copy_" and is_marked(args[0]) != is_marked(args[1])
         if name in _WAITING or (name == "where" and len(args) == 1) or (crosses and not quick):
             self._wait(name)
+        elif name == "new_tensor":
+            self._wait(name)
         elif name in ("__getitem__", "__setitem__"):
+            index = args[1] if isinstance(args[1], tuple) else (args[1],)
+            if any(isinstance(part, list) for part in index):
+                self._wait(f"{name} with a list")
             masks = [t for t in _tensors([args[1]]) if t.dtype == torch.bool and t.dim()]
             # A number is written where the mask says without looking at the mask.
             if masks and not (name == "__setitem__" and not isinstance(args[2], torch.Tensor)):
@@ -238,14 +252,18 @@ class PretendCuda(TorchFunctionMode):
             self._wait(name)
 
     def _wait(self, name: str) -> None:
+        self.waits[f"{self._place()}: {name}"] += 1
+
+    @staticmethod
+    def _place() -> str:
+        """Return `file:line function` of the innermost line of mjlab."""
         frame = sys._getframe(1)
         while frame is not None and not frame.f_code.co_filename.startswith(_SOURCES):
             frame = frame.f_back
-        where = "outside"
-        if frame is not None:
-            path = Path(frame.f_code.co_filename).relative_to(_SOURCES)
-            where = f"{path}:{frame.f_lineno} {frame.f_code.co_name}"
-        self.waits[f"{where}: {name}"] += 1
+        if frame is None:
+            return "outside"
+        path = Path(frame.f_code.co_filename).relative_to(_SOURCES)
+        return f"{path}:{frame.f_lineno} {frame.f_code.co_name}"
 
 
 class PretendEngine(Engine):

@@ -188,7 +188,8 @@ class Engine(ABC):
     engine writes results into them, and what is written into them in place is the input of the
     next call. A tensor returned by `data_field` stays valid for the life of the engine.
 
-    `env_ids` is None for all environments, or a sorted, unique, one-dimensional int64 tensor.
+    `env_ids` is None for all environments, or a one-dimensional int64 tensor, which is sorted and
+    unique on a CPU.
     """
 
     capabilities: Capabilities

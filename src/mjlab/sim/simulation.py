@@ -520,7 +520,7 @@ class Simulation:
         self._engine.close()
 
     def resolve_ids(self, env_ids: EnvIds) -> torch.Tensor | None:
-        """Return `env_ids` as the engine takes them: None, or sorted unique int64 on the device."""
+        """Return `env_ids` as the engine takes them: None, or int64, on a CPU sorted and unique."""
         if env_ids is None:
             return None
         if isinstance(env_ids, slice):
@@ -529,9 +529,11 @@ class Simulation:
             return torch.arange(self.num_envs, device=self.device)[env_ids].sort().values
         if env_ids.dtype == torch.bool:
             return env_ids.nonzero().flatten()
-        if env_ids.numel() < 2:
-            return env_ids.to(self.device, torch.int64)
-        return torch.unique(env_ids.to(self.device, torch.int64), sorted=True)
+        env_ids = env_ids.to(self.device, torch.int64)
+        # To sort them, the host would have to wait for a GPU.
+        if env_ids.is_cuda or env_ids.numel() < 2:
+            return env_ids
+        return torch.unique(env_ids, sorted=True)
 
 
 def _reshape_rows(field: str, tensor: torch.Tensor) -> torch.Tensor:

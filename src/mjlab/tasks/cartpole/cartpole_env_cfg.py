@@ -23,6 +23,7 @@ from mjlab.envs.mdp import (
     reset_joints_by_offset,
     time_out,
 )
+from mjlab.envs.mdp._indexing import columns
 from mjlab.managers import (
     EventTermCfg,
     ObservationGroupCfg,
@@ -96,7 +97,7 @@ def pole_angle_cos_sin(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _HING
     The angle of a hinge without limits grows with every turn; these repeat.
     """
     asset: Entity = env.scene[asset_cfg.name]
-    angle = asset.data.joint_pos[:, asset_cfg.joint_ids]
+    angle = asset.data.joint_pos[:, columns(asset_cfg.joint_ids, env.device)]
     return torch.cat([torch.cos(angle), torch.sin(angle)], dim=-1)
 
 
@@ -125,10 +126,12 @@ def cartpole_smooth_reward(
     the pole is upright, the cart centred, the control small and the pole still, all at once.
     """
     asset: Entity = env.scene[cart_cfg.name]
-    cart_pos = asset.data.joint_pos[:, cart_cfg.joint_ids].squeeze(-1)
-    control = asset.data.joint_effort_target[:, cart_cfg.joint_ids].squeeze(-1)
-    pole_angle = asset.data.joint_pos[:, hinge_cfg.joint_ids].squeeze(-1)
-    pole_vel = asset.data.joint_vel[:, hinge_cfg.joint_ids].squeeze(-1)
+    slider = columns(cart_cfg.joint_ids, env.device)
+    hinge = columns(hinge_cfg.joint_ids, env.device)
+    cart_pos = asset.data.joint_pos[:, slider].squeeze(-1)
+    control = asset.data.joint_effort_target[:, slider].squeeze(-1)
+    pole_angle = asset.data.joint_pos[:, hinge].squeeze(-1)
+    pole_vel = asset.data.joint_vel[:, hinge].squeeze(-1)
 
     upright = (torch.cos(pole_angle) + 1.0) / 2.0
     centered = (1.0 + _gaussian_tolerance(cart_pos, margin=2.0)) / 2.0

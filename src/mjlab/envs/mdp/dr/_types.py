@@ -151,7 +151,8 @@ def draw(
     """
     if distribution.check is not None:
         distribution.check(*bounds)
-    lower, upper = torch.tensor(bounds, device=device).unbind()
+    # Filled on the device: copies from the host would wait for it.
+    lower, upper = (torch.full((), b, dtype=torch.float32, device=device) for b in bounds)
     sample = distribution.sample(lower, upper, shape, device)
     if sample.shape != torch.Size(shape):
         raise ValueError(
