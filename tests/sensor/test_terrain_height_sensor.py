@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from mjlab.sensor import ObjRef, RingPatternCfg, TerrainHeightSensorCfg
+from mjlab.sensor._one_sided_ground import OneSidedGround
 
 from .ray_scenes import BASE, ROBOT, field_of, floor, scene_with, sense
 
@@ -180,3 +181,32 @@ def test_the_height_data_has_the_fields_of_the_ray_data_too():
     data = scene["height"].data
     torch.testing.assert_close(data.distances, torch.ones(1, 5))
     assert data.frame_pos_w.shape == (1, 1, 3)
+
+
+def test_ground_is_found_around_a_point_and_not_among_all_of_it():
+    """A hundred patches, each at its own height and yaw, and a floor below them."""
+    generator = torch.Generator().manual_seed(0)
+    spec = mujoco.MjSpec()
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    heights = torch.rand(100, generator=generator)
+    for i, z in enumerate(heights.tolist()):
+        yaw = [1.0, 0.0, 0.0, 0.0] if i % 2 else [math.cos(0.2), 0.0, 0.0, math.sin(0.2)]
+        pos = [float(i // 10), float(i % 10), z]
+        spec.worldbody.add_geom(type=plane, size=[0.5, 0.5, 1], pos=pos, quat=yaw)
+    spec.worldbody.add_geom(type=plane, size=[0, 0, 1], pos=[0, 0, -0.5])
+    model = spec.compile()
+    ground = OneSidedGround(model, None, None, "cpu")
+    points = torch.rand(2000, 3, generator=generator) * torch.tensor([12.0, 12.0, 2.0])
+    points -= torch.tensor([1.5, 1.5, 1.0])
+    points[0] = torch.nan
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    local = points[:, None] - torch.as_tensor(data.geom_xpos).float()
+    frames = torch.as_tensor(data.geom_xmat).float().view(-1, 3, 3)
+    local = (frames * local[..., None]).sum(dim=-2)
+    size = torch.as_tensor(model.geom_size[:, :2]).float()
+    inside = ((local[..., :2].abs() <= size) | (size == 0)).all(dim=-1)
+    expected = (inside & (local[..., 2] < 0)).any(dim=-1)
+    assert 0.2 < expected.float().mean() < 0.8
+    assert torch.equal(ground.is_above(points, torch.zeros(2000, dtype=torch.long)), expected)
+    assert ground._around(points).shape[1] <= 10

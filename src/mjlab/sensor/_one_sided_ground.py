@@ -10,6 +10,10 @@ import torch
 
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _HFIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
+# Cells of the grid that finds the ground around a point, at most, along x and along y.
+_MOST_CELLS = 512
+# Single precision may put a point beyond the edge that it is on (m).
+_EDGE = 1e-3
 
 
 class OneSidedGround:
@@ -60,34 +64,71 @@ class OneSidedGround:
         # Planes among height fields read elevations too, which then count for nothing.
         self._has_fields = bool(is_field.any())
         self._heights = _tensor(m.hfield_data, device)
+        self._make_grid(host.geom_xpos[geoms], host.geom_xmat[geoms], extent, carried, device)
+
+    def _make_grid(
+        self, pos: np.ndarray, mat: np.ndarray, extent: np.ndarray, carried: np.ndarray, device: str
+    ) -> None:
+        """List the surfaces above and below each cell of a grid over x and y.
+
+        Surfaces that move, have no end or lean are listed everywhere.
+        """
+        mat = mat.reshape(-1, 3, 3)
+        is_local = ~carried & np.isfinite(extent).all(axis=1) & (mat[:, 2, 2] > 1.0 - 1e-9)
+        local = np.flatnonzero(is_local)
+        half = (np.abs(mat[local, :2, :2]) * extent[local, None, :]).sum(axis=-1) + _EDGE
+        low, high = pos[local, :2] - half, pos[local, :2] + half
+        start, end = (
+            (low.min(axis=0), high.max(axis=0)) if len(local) else (np.zeros(2), np.ones(2))
+        )
+        # With half as wide cells as the smallest surface, few surfaces meet in one.
+        narrowest = half.min(axis=0) if len(local) else np.ones(2)
+        count = np.ceil((end - start) / narrowest).clip(1, _MOST_CELLS).astype(int)
+        size = (end - start) / count
+        first = np.floor((low - start) / size).astype(int).clip(0, count - 1)
+        last = np.floor((high - start) / size).astype(int).clip(0, count - 1)
+        # The last cell is everything beyond the grid.
+        cells: list[list[int]] = [[] for _ in range(count.prod() + 1)]
+        for geom, (x0, y0), (x1, y1) in zip(local.tolist(), first, last, strict=True):
+            for x in range(x0, x1 + 1):
+                for y in range(y0, y1 + 1):
+                    cells[x * count[1] + y].append(geom)
+        everywhere = np.flatnonzero(~is_local).tolist()
+        width = max(len(cell) for cell in cells)
+        table = [cell + [-1] * (width - len(cell)) + everywhere for cell in cells]
+        self._grid = torch.tensor(table, dtype=torch.long, device=device)
+        self._grid_start, self._grid_size = _tensor(start, device), _tensor(size, device)
+        self._grid_count = torch.from_numpy(count).to(device)
+
+    def _around(self, points: torch.Tensor) -> torch.Tensor:
+        """Return the surfaces that may be above or below points (M, 3), (M, K); -1 for none."""
+        cell = ((points[:, :2] - self._grid_start) / self._grid_size).nan_to_num(-1.0).floor()
+        is_outside = ((cell < 0) | (cell >= self._grid_count)).any(dim=-1)
+        x, y = cell.clamp(min=0.0, max=float(_MOST_CELLS)).long().unbind(-1)
+        rows = torch.where(is_outside, len(self._grid) - 1, x * self._grid_count[1] + y)
+        return self._grid[rows]
 
     def __len__(self) -> int:
         return len(self._geoms)
 
-    def is_above(self, points: torch.Tensor, envs: torch.Tensor | None = None) -> torch.Tensor:
+    def is_above(self, points: torch.Tensor, envs: torch.Tensor) -> torch.Tensor:
         """Return whether each of the world points (M, 3) has such ground above it, (M,) bool.
 
         `envs` (M,) says which environment each point is in.
         """
-        pos, mat = self._pos, self._mat
+        found = self._around(points)
+        geoms = found.clamp(min=0)
+        pos = self._pos[geoms]
         if self._is_placed_by_env:
-            rows = slice(None) if envs is None else envs
-            pos = self._data.geom_xpos[:, self._geoms][rows]
-            mat = self._data.geom_xmat[:, self._geoms][rows]
-        # (M, G, 3): the points in the frames of the geoms.
+            pos = self._data.geom_xpos[envs[:, None], self._geoms[geoms]]
+        # (M, K, 3): the points in the frames of the geoms.
         local = points[:, None] - pos
         if self._is_placed_by_env or self._is_turned:
+            mat = self._mat[geoms]
+            if self._is_placed_by_env:
+                mat = self._data.geom_xmat[envs[:, None], self._geoms[geoms]]
             local = (mat * local[..., :, None]).sum(dim=-2)
-        inside = (local[..., :2].abs() <= self._extent).all(dim=-1)
-        if points.device.type == "cpu":
-            # Few of the geoms are around each point. On a GPU, finding which would wait.
-            rows, geoms = inside.nonzero(as_tuple=True)
-            near = local[rows, geoms]
-            below = near[:, 2] < self._surface(near, geoms)
-            return torch.zeros(len(points), dtype=torch.bool).index_put_(
-                (rows[below],), torch.tensor(True)
-            )
-        geoms = torch.arange(len(self), device=points.device).expand(inside.shape)
+        inside = (local[..., :2].abs() <= self._extent[geoms]).all(dim=-1) & (found >= 0)
         return (inside & (local[..., 2] < self._surface(local, geoms))).any(dim=-1)
 
     def _surface(self, local: torch.Tensor, geoms: torch.Tensor) -> torch.Tensor:

@@ -44,7 +44,7 @@ from mjlab.sim.sensor_fed import refuse_without_sensor
 from mjlab.sim.warp.overflow import OverflowWatch, contacts_per_environment
 from mjlab.sim.warp.rays import WarpRays
 from mjlab.sim.warp.render import WarpRenderer
-from mjlab.utils.lab_api.math import matrix_from_quat
+from mjlab.utils.lab_api.math import matrix_from_quat, matrix_product
 
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
@@ -489,9 +489,7 @@ class WarpEngine(Engine):
         self.data_field("geom_xpos")[:, geoms] = self.data_field("xpos")[:, bodies] + (
             frames * positions[..., None, :]
         ).sum(dim=-1)
-        self.data_field("geom_xmat")[:, geoms] = (
-            frames[..., None] * rotations[..., None, :, :]
-        ).sum(dim=-2)
+        self.data_field("geom_xmat")[:, geoms] = matrix_product(frames, rotations)
 
     def reset(self, env_ids: torch.Tensor | None) -> None:
         # `mjwarp.reset_data` clears the contacts of all environments together with those of the

@@ -36,6 +36,14 @@ def copysign(mag: float, other: torch.Tensor) -> torch.Tensor:
     return torch.copysign(torch.full_like(other, abs(mag)), other)
 
 
+def matrix_product(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    """Return the products (..., i, k) of small matrices (..., i, j) and (..., j, k).
+
+    They are sums, because a GPU may round the operands of `@` to TF32: 8 mm at 10 m.
+    """
+    return (first.unsqueeze(-1) * second.unsqueeze(-3)).sum(dim=-2)
+
+
 def skew_symmetric_matrix(vec: torch.Tensor) -> torch.Tensor:
     """Return S with S u = vec x u; (..., 3) gives (..., 3, 3)."""
     x, y, z = vec.unbind(-1)

@@ -7,7 +7,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 import torch
 
-from mjlab.utils.lab_api._basics import normalize
+from mjlab.utils.lab_api._basics import matrix_product, normalize
 
 ArrayT = TypeVar("ArrayT", torch.Tensor, np.ndarray)
 
@@ -131,7 +131,7 @@ def matrix_from_euler(euler_angles: torch.Tensor, convention: str) -> torch.Tens
         _axis_rotation(axis, angle)
         for axis, angle in zip(convention, euler_angles.unbind(-1), strict=True)
     )
-    return first @ second @ third
+    return matrix_product(matrix_product(first, second), third)
 
 
 def _axis_rotation(axis: str, angle: torch.Tensor) -> torch.Tensor:
@@ -163,7 +163,8 @@ def convert_camera_frame_orientation_convention(
     # Rows of the table are rows of matrices that take coordinates of a convention to OpenGL's.
     from_origin = orientation.new_tensor(_IN_OPENGL[origin])
     from_target = orientation.new_tensor(_IN_OPENGL[target])
-    return quat_from_matrix(matrix_from_quat(orientation) @ from_origin.T @ from_target)
+    turned = matrix_product(matrix_from_quat(orientation), from_origin.T)
+    return quat_from_matrix(matrix_product(turned, from_target))
 
 
 def create_rotation_matrix_from_view(

@@ -6,6 +6,7 @@ import math
 
 import torch
 
+from mjlab.utils.lab_api._basics import matrix_product
 from mjlab.utils.lab_api._conversions import (
     matrix_from_euler,
     matrix_from_quat,
@@ -44,12 +45,12 @@ def pose_inv(pose: torch.Tensor) -> torch.Tensor:
     """Return the inverse of poses (..., 4, 4)."""
     pos, rot = unmake_pose(pose)
     back = rot.transpose(-1, -2)
-    return make_pose(-(back @ pos.unsqueeze(-1)).squeeze(-1), back)
+    return make_pose(-(back * pos.unsqueeze(-2)).sum(dim=-1), back)
 
 
 def pose_in_A_to_pose_in_B(pose_in_A: torch.Tensor, pose_A_in_B: torch.Tensor) -> torch.Tensor:
     """Return a pose given in frame A in frame B, whose pose of A is `pose_A_in_B`."""
-    return pose_A_in_B @ pose_in_A
+    return matrix_product(pose_A_in_B, pose_in_A)
 
 
 def transform_poses_from_frame_A_to_frame_B(
@@ -62,7 +63,7 @@ def transform_poses_from_frame_A_to_frame_B(
         frame_A: Pose of A in the world, (4, 4).
         frame_B: Pose of B in the world, (4, 4).
     """
-    return frame_B @ (pose_inv(frame_A) @ src_poses)
+    return matrix_product(frame_B, matrix_product(pose_inv(frame_A), src_poses))
 
 
 def interpolate_rotations(
@@ -82,10 +83,10 @@ def interpolate_rotations(
         raise ValueError(f"num_steps is {num_steps}; it must be at least 1.")
     fractions = [step / num_steps for step in range(num_steps)]
     if axis_angle:
-        vector = axis_angle_from_quat(quat_from_matrix(R2 @ R1.transpose(-1, -2)))
+        vector = axis_angle_from_quat(quat_from_matrix(matrix_product(R2, R1.transpose(-1, -2))))
         angle = torch.linalg.vector_norm(vector) * R1.new_tensor(fractions)
         turns = matrix_from_quat(quat_from_angle_axis(angle, vector.expand(num_steps, 3)))
-        steps = turns @ R1
+        steps = matrix_product(turns, R1)
     else:
         q1, q2 = quat_from_matrix(R1), quat_from_matrix(R2)
         steps = matrix_from_quat(torch.stack([quat_slerp(q1, q2, tau) for tau in fractions]))

@@ -6,6 +6,7 @@ axis times angle.
 
 from mjlab.utils.lab_api._basics import (
     copysign,
+    matrix_product,
     normalize,
     saturate,
     scale_transform,
@@ -98,6 +99,7 @@ __all__ = [
     "make_pose",
     "matrix_from_euler",
     "matrix_from_quat",
+    "matrix_product",
     "normalize",
     "orthogonalize_perspective_depth",
     "pose_in_A_to_pose_in_B",
