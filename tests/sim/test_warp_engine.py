@@ -538,12 +538,12 @@ def test_warp_is_quiet_unless_asked_otherwise(
     assert (wp.config.log_level > wp.LOG_INFO) is quiet
 
 
-# Order of work. Warp's stream waits for what torch has queued when `_ordered` is entered: what torch
+# Order of work. Warp's stream waits for what torch has queued when `ordered` is entered: what torch
 # queued within, Warp might read before it is there.
 
 
 class _WorkOfTorch(TorchFunctionMode):
-    """Notes the functions of torch that compute while an engine is within `_ordered`."""
+    """Notes the functions of torch that compute while an engine is within `ordered`."""
 
     LOOKING = frozenset(
         {
@@ -574,7 +574,7 @@ class _WorkOfTorch(TorchFunctionMode):
 
 def test_torch_computes_nothing_that_warp_reads_within_the_same_wait() -> None:
     engine = make_engine(LANDING_BOX)
-    work, ordered = _WorkOfTorch(), engine._ordered
+    work, ordered = _WorkOfTorch(), engine.ordered
 
     @contextmanager
     def noted():
@@ -583,7 +583,7 @@ def test_torch_computes_nothing_that_warp_reads_within_the_same_wait() -> None:
             yield
             work.is_ordered = False
 
-    engine._ordered = noted
+    engine.ordered = noted
     # Not contiguous and of other types, so that they have to be copied.
     points = torch.zeros(3, 2).T
     bodies = torch.tensor([[1, 0], [1, 0]])[:, 0]
@@ -611,7 +611,7 @@ def as_on_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
             yield
 
     monkeypatch.setattr(WarpEngine, "_on_cuda", True)
-    monkeypatch.setattr(WarpEngine, "_ordered", ordered)
+    monkeypatch.setattr(WarpEngine, "ordered", ordered)
 
 
 def test_graphs_are_captured_at_construction_without_a_trace(

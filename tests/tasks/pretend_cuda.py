@@ -35,7 +35,7 @@ _MARK = "_is_on_pretended_cuda"
 _WAITING = frozenset(
     {"item", "tolist", "nonzero", "masked_select", "unique", "unique_consecutive", "equal"}
     | {"allclose", "is_nonzero", "__bool__", "__float__", "__int__", "__index__", "__contains__"}
-    | {"argwhere", "bincount", "__format__", "__repr__"}
+    | {"argwhere", "bincount", "new_tensor", "__format__", "__repr__"}
 )
 # Make a tensor of host data, so that with a device they copy it there and wait.
 _FROM_HOST = frozenset({"tensor", "as_tensor", "asarray"})
@@ -237,8 +237,6 @@ class PretendCuda(TorchFunctionMode):
             return
         crosses = name == "copy_" and is_marked(args[0]) != is_marked(args[1])
         if name in _WAITING or (name == "where" and len(args) == 1) or (crosses and not quick):
-            self._wait(name)
-        elif name == "new_tensor":
             self._wait(name)
         elif name in ("__getitem__", "__setitem__"):
             index = args[1] if isinstance(args[1], tuple) else (args[1],)

@@ -98,7 +98,7 @@ class CommandTerm(ManagerTermBase):
             self._resample(due)
         self._update_command(env_ids)
 
-    def reset(self, env_ids: torch.Tensor | slice | None) -> dict[str, torch.Tensor]:
+    def reset(self, env_ids: torch.Tensor | slice | None) -> dict[str, Any]:
         """Draw new commands in these environments, and return and zero the mean of each metric.
 
         Environments where a metric is NaN or infinite are left out of its mean.
@@ -106,7 +106,7 @@ class CommandTerm(ManagerTermBase):
         ids = as_ids(env_ids, self.num_envs, self.device)
         if is_empty(ids):
             return {}
-        log: dict[str, torch.Tensor] = {}
+        log: dict[str, Any] = {}
         if self.metrics:
             means = torch.stack([finite_mean(v[ids].float()) for v in self.metrics.values()])
             log = dict(zip(self.metrics, means.unbind(), strict=True))

@@ -241,7 +241,7 @@ class Simulation:
     @property
     def wp_device(self) -> Any:
         """Warp's device; AttributeError on another engine."""
-        return self._warp_engine("wp_device", "sim.device").wp_data.time.device
+        return self._warp_engine("wp_device", "sim.device").wp_device
 
     def render_context(self, views: tuple[CameraView, ...], view: CameraView) -> Any:
         """Return MuJoCo Warp's context of a view, one of `views` that were rendered together.

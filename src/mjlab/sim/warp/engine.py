@@ -14,7 +14,7 @@ import difflib
 import gc
 import logging
 import os
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -131,6 +131,7 @@ class WarpEngine(Engine):
         self.num_envs = num_envs
         self.device = torch.device(device)
         self.wp_device = _find_device(self.device)
+        self.mj_model = model
         self._host = mujoco.MjData(model)
         mujoco.mj_forward(model, self._host)
         self._velocity_constraints = bool(
@@ -139,7 +140,7 @@ class WarpEngine(Engine):
         # MuJoCo leaves these at zero; Warp fills them up when it recomputes constants.
         self._zero_invweight0 = torch.as_tensor(model.body_invweight0 == 0, device=device)
         self._torch_streams: dict[int, Any] = {}
-        with self._ordered():
+        with self.ordered():
             self._allocate(model, cfg)
         cfg.apply_wp_opt(self.wp_model.opt)
         self._data_tensors: dict[str, torch.Tensor] = {}
@@ -238,7 +239,7 @@ class WarpEngine(Engine):
         return self.wp_device.is_cuda
 
     @contextmanager
-    def _ordered(self) -> Generator[None]:
+    def ordered(self) -> Generator[None]:
         """Run Warp's work after what torch has queued and before what torch will queue.
 
         Warp works on its own stream, because memory that it frees is freed in that stream's
@@ -249,17 +250,14 @@ class WarpEngine(Engine):
             if not self._on_cuda:
                 yield
                 return
-            torch_stream = self._torch_stream()
+            stream = torch.cuda.current_stream(self.device)
+            # As Warp sees it; made once for each.
+            if stream.cuda_stream not in self._torch_streams:
+                self._torch_streams[stream.cuda_stream] = wp.stream_from_torch(stream)
+            torch_stream = self._torch_streams[stream.cuda_stream]
             self.wp_device.stream.wait_stream(torch_stream)
             yield
             torch_stream.wait_stream(self.wp_device.stream)
-
-    def _torch_stream(self) -> Any:
-        """Return torch's current stream as Warp sees it; made once for each."""
-        stream = torch.cuda.current_stream(self.device)
-        if stream.cuda_stream not in self._torch_streams:
-            self._torch_streams[stream.cuda_stream] = wp.stream_from_torch(stream)
-        return self._torch_streams[stream.cuda_stream]
 
     def launch(
         self, name: str, work: Callable[[], None], times: int = 1, on_cpu: bool = True
@@ -270,7 +268,7 @@ class WarpEngine(Engine):
         load them during a capture. All runs on the CPU are plain without `on_cpu`, for work that a
         capture does not record there: filling arrays, and refitting trees.
         """
-        with self._ordered():
+        with self.ordered():
             if name not in self._loaded and (self._on_cuda or not on_cpu):
                 work()
                 times -= 1
@@ -321,7 +319,7 @@ class WarpEngine(Engine):
                 self.launch(stage, lambda stage=stage: self._forward(stage))
         for name, value in before.items():
             self.data_field(name).copy_(value)
-        self.launch("acc", lambda: self._forward("acc"))
+        self.forward(None)
         # What overflowed then is no fault of the user's.
         as_torch(self.wp_data.overflow).zero_()
 
@@ -339,7 +337,7 @@ class WarpEngine(Engine):
             return _as_tensors(self.wp_data.contact)
         if name not in self._data_tensors:
             array = find_data_field(self.wp_data, name)
-            refuse_without_sensor(self._host.model, name)
+            refuse_without_sensor(self.mj_model, name)
             shape = getattr(getattr(self._host, name), "shape", ())
             if name in ROTATION_MATRICES:
                 shape = (*shape[:-1], 3, 3)
@@ -357,7 +355,7 @@ class WarpEngine(Engine):
     @torch.inference_mode(False)
     def expand(self, fields: tuple[str, ...]) -> None:
         new = [name for name in dict.fromkeys(fields) if name not in self._model_tensors]
-        with self._ordered():
+        with self.ordered():
             expand_arrays(self.wp_model, self.num_envs, new)
         for name in new:
             struct, attribute = find_model_field(self.wp_model, name)
@@ -373,7 +371,7 @@ class WarpEngine(Engine):
         self._absent = absent
         # For those who read them: Warp itself has one for all environments.
         for name in COLLISION_MASKS:
-            mask = torch.as_tensor(getattr(self._host.model, name), device=self.device)
+            mask = torch.as_tensor(getattr(self.mj_model, name), device=self.device)
             self._model_tensors[name] = mask.expand(absent.shape).masked_fill(absent, 0)
 
     def constants_written_by(self, level: int) -> tuple[str, ...]:
@@ -394,7 +392,7 @@ class WarpEngine(Engine):
         others = self._rows_except(env_ids)
         kept = [(self._model_tensors[name], others) for name in written if others is not None]
         with _keeping(kept):
-            with self._ordered():
+            with self.ordered():
                 _RECOMPUTE[level](self.wp_model, self.wp_data)
             if "body_invweight0" in written:
                 self._restore_zero_invweights()
@@ -502,10 +500,10 @@ class WarpEngine(Engine):
         for name, source in (("mocap_pos", "body_pos"), ("mocap_quat", "body_quat")):
             poses = as_torch(getattr(self.wp_model, source))
             _set_rows(self.data_field(name), env_ids, poses[:, self._mocap_bodies])
-        if self._host.model.nhistory:
+        if self.mj_model.nhistory:
             mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
             mask.fill_(True) if env_ids is None else mask.index_fill_(0, env_ids, True)
-            with self._ordered():
+            with self.ordered():
                 mjwarp.reset_history(self.wp_model, self.wp_data, reset=wp.from_torch(mask))
 
     def check_overflow(self) -> None:
@@ -541,7 +539,7 @@ class WarpEngine(Engine):
         if self.capabilities.raycast_problem is not None:
             raise UnsupportedByWarpError(self.capabilities.raycast_problem)
         if self._rays is None:
-            self._rays = WarpRays(self._host.model, self.wp_model, self.wp_data, self.launch)
+            self._rays = WarpRays(self)
         distances, normals, geom_ids = self._rays.cast(
             origins, directions, geom_groups, exclude_body_ids
         )
@@ -556,10 +554,8 @@ class WarpEngine(Engine):
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:
         if self._renderer is None:
-            self._renderer = WarpRenderer(
-                self._host.model, self.wp_model, self.wp_data, self._ordered, self.launch
-            )
-        return self._renderer.render(views, self._model_tensors.keys())
+            self._renderer = WarpRenderer(self)
+        return self._renderer.render(views, frozenset(self._model_tensors))
 
     def render_context(self, views: tuple[CameraView, ...], view: CameraView) -> Any:
         """Return the `mujoco_warp.RenderContext` of a view, one of `views` rendered together."""
@@ -570,12 +566,12 @@ class WarpEngine(Engine):
     def jacobian(
         self, points: torch.Tensor, body_ids: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        shape = (self.num_envs, 3, self._host.model.nv)
+        shape = (self.num_envs, 3, self.mj_model.nv)
         translational = torch.empty(shape, dtype=torch.float32, device=self.device)
         rotational = torch.empty_like(translational)
         # Copied before Warp's stream starts to wait for torch's, which it does only once.
         points, body_ids = points.float().contiguous(), body_ids.to(torch.int32).contiguous()
-        with self._ordered():
+        with self.ordered():
             mjwarp.jac(
                 self.wp_model,
                 self.wp_data,
@@ -665,7 +661,7 @@ def refuse_unsupported(model: mujoco.MjModel) -> None:
 
 
 @contextmanager
-def _keeping(kept: list[tuple[torch.Tensor, torch.Tensor | None]]) -> Generator[None]:
+def _keeping(kept: Sequence[tuple[torch.Tensor, torch.Tensor | None]]) -> Generator[None]:
     """Undo what happens within where a mask over the first dimensions is true (None: everywhere)."""
     before = [tensor.clone() for tensor, _ in kept]
     yield

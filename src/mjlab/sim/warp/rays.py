@@ -7,14 +7,15 @@ not, and try every geom for every ray.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import mujoco
 import mujoco_warp
 import numpy as np
 import torch
 import warp
+
+if TYPE_CHECKING:
+    from mjlab.sim.warp.engine import WarpEngine
 
 # A type checker cannot follow how these two packages annotate their arrays.
 mjwarp: Any = mujoco_warp
@@ -24,14 +25,8 @@ wp: Any = warp
 class WarpRays:
     """Rays of one Warp engine. Each number of rays into some geom groups is one graph."""
 
-    def __init__(
-        self, host: mujoco.MjModel, model: Any, data: Any, launch: Callable[..., None]
-    ) -> None:
-        """Cast in the worlds of `data`; `host` is the model on the host.
-
-        `launch` is `WarpEngine.launch`.
-        """
-        self._host, self._model, self._data, self._launch = host, model, data, launch
+    def __init__(self, engine: WarpEngine) -> None:
+        self._engine = engine
         self._queries: dict[Any, _Query] = {}
 
     def cast(
@@ -46,7 +41,7 @@ class WarpRays:
         They are overwritten by the next call with as many rays into the same groups.
         """
         # MuJoCo counts a group beyond 0 to 5 as the nearest of these.
-        present = np.unique(self._host.geom_group)
+        present = np.unique(self._engine.mj_model.geom_group)
         if geom_groups is not None:
             present = present[np.isin(present.clip(0, 5), geom_groups)]
         groups = tuple(present.tolist())
@@ -61,22 +56,23 @@ class WarpRays:
         else:
             query.excluded.copy_(exclude_body_ids)
         if groups:
-            self._launch(f"rays {key}", lambda: self._run(query, groups), on_cpu=False)
+            self._engine.launch(f"rays {key}", lambda: self._run(query, groups), on_cpu=False)
         return query.distances, query.normals, query.geom_ids
 
     def _run(self, query: _Query, groups: tuple[int, ...]) -> None:
+        model, data = self._engine.wp_model, self._engine.wp_data
         if query.context is None:
             query.context = mjwarp.create_render_context(
-                self._host,
-                self._data.nworld,
+                self._engine.mj_model,
+                data.nworld,
                 cam_active=[],
                 use_textures=False,
                 enabled_geom_groups=list(groups),
             )
-        mjwarp.refit_bvh(self._model, self._data, query.context)
+        mjwarp.refit_bvh(model, data, query.context)
         mjwarp.rays(
-            self._model,
-            self._data,
+            model,
+            data,
             wp.from_torch(query.origins, dtype=wp.vec3),
             wp.from_torch(query.directions, dtype=wp.vec3),
             # The context holds the geoms of these groups and no others.
@@ -95,12 +91,12 @@ class _Query:
 
     @torch.inference_mode(False)
     def __init__(self, num_worlds: int, num_rays: int, device: torch.device) -> None:
-        shape, real = (num_worlds, num_rays), {"dtype": torch.float32, "device": device}
-        whole = {"dtype": torch.int32, "device": device}
-        self.origins = torch.zeros(*shape, 3, **real)
-        self.directions = torch.zeros(*shape, 3, **real)
+        real: Any = {"dtype": torch.float32, "device": device}
+        whole: Any = {"dtype": torch.int32, "device": device}
+        self.origins = torch.zeros(num_worlds, num_rays, 3, **real)
+        self.directions = torch.zeros(num_worlds, num_rays, 3, **real)
         self.excluded = torch.zeros(num_rays, **whole)
-        self.distances = torch.full(shape, -1.0, **real)
-        self.normals = torch.zeros(*shape, 3, **real)
-        self.geom_ids = torch.full(shape, -1, **whole)
+        self.distances = torch.full((num_worlds, num_rays), -1.0, **real)
+        self.normals = torch.zeros(num_worlds, num_rays, 3, **real)
+        self.geom_ids = torch.full((num_worlds, num_rays), -1, **whole)
         self.context: Any = None

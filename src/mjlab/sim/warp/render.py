@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Collection
-from contextlib import AbstractContextManager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import mujoco_warp
@@ -15,6 +13,9 @@ import torch
 import warp
 
 from mjlab.sim.rendering import LENS_FIELDS, CameraView, Images
+
+if TYPE_CHECKING:
+    from mjlab.sim.warp.engine import WarpEngine
 
 # A type checker cannot follow how these two packages annotate their arrays.
 mjwarp: Any = mujoco_warp
@@ -33,33 +34,20 @@ class WarpRenderer:
     its cameras at once; so there is one for all views that agree in these.
     """
 
-    def __init__(
-        self,
-        host: mujoco.MjModel,
-        model: Any,
-        data: Any,
-        ordered: Callable[[], AbstractContextManager[None]],
-        launch: Callable[..., None],
-    ) -> None:
-        """Render the worlds of `data`.
-
-        `host` is the model on the host; Warp's work is done within `ordered()`, or by `launch`,
-        which is `WarpEngine.launch`.
-        """
-        self._host, self._model, self._data = host, model, data
-        self._ordered, self._launch = ordered, launch
+    def __init__(self, engine: WarpEngine) -> None:
+        self._engine = engine
         self._scenes: dict[Any, _Scene] = {}
         # A graph's name is used once, so that none is replayed for another context.
         self._numbers = itertools.count()
 
-    def render(self, views: tuple[CameraView, ...], expanded: Collection[str]) -> list[Images]:
+    def render(self, views: tuple[CameraView, ...], expanded: frozenset[str]) -> list[Images]:
         """Render views at the poses that derived fields have; see `Engine.render`.
 
         `expanded` are the names of the model fields that differ between environments.
         """
         images: dict[int, Images] = {}
-        for scene in self._scenes_of(views, frozenset(expanded)):
-            images.update(scene.render(self._model, self._data))
+        for scene in self._scenes_of(views, expanded):
+            images.update(scene.render())
         return [images[i] for i in range(len(views))]
 
     def context_of(self, views: tuple[CameraView, ...], view: CameraView) -> Any:
@@ -80,16 +68,9 @@ class WarpRenderer:
             key = (views, settings)
             if key not in self._scenes or self._scenes[key].expanded != relevant:
                 # Images that are made here are written into in later calls, in whatever mode.
-                with self._ordered(), torch.inference_mode(False):
+                with self._engine.ordered(), torch.inference_mode(False):
                     self._scenes[key] = _Scene(
-                        self._host,
-                        self._model,
-                        self._data.nworld,
-                        members,
-                        relevant,
-                        self._ordered,
-                        self._launch,
-                        f"render {next(self._numbers)}",
+                        self._engine, members, relevant, f"render {next(self._numbers)}"
                     )
             scenes.append(self._scenes[key])
         return scenes
@@ -100,17 +81,14 @@ class _Scene:
 
     def __init__(
         self,
-        host: mujoco.MjModel,
-        model: Any,
-        num_worlds: int,
+        engine: WarpEngine,
         views: dict[int, CameraView],
         expanded: frozenset[str],
-        ordered: Callable[[], AbstractContextManager[None]],
-        launch: Callable[..., None],
         name: str,
     ) -> None:
         self.views, self.expanded = views, expanded
-        self._ordered, self._launch, self._name = ordered, launch, name
+        self._engine, self._name = engine, name
+        host = engine.mj_model
         members = list(views.values())
         first = members[0]
         # MuJoCo counts a group beyond 0 to 5 as the nearest of these.
@@ -118,19 +96,17 @@ class _Scene:
         groups = groups[np.isin(groups.clip(0, 5), first.geom_groups)]
         self.context = None
         if len(groups):
-            self.context = self._make_context(host, num_worlds, members, groups.tolist())
+            self.context = self._make_context(members, groups.tolist())
         self._dataid: Any = None
         if "geom_dataid" in expanded and self.context is not None:
-            self._dataid = _without_absent_meshes(host, model, self.context)
-        self._images = self._read_images(num_worlds)
+            self._dataid = _without_absent_meshes(host, engine.wp_model, self.context)
+        self._images = self._read_images(engine.num_envs)
 
-    def _make_context(
-        self, host: mujoco.MjModel, num_worlds: int, views: list[CameraView], groups: list[int]
-    ) -> Any:
+    def _make_context(self, views: list[CameraView], groups: list[int]) -> Any:
         first = views[0]
         context = mjwarp.create_render_context(
-            host,
-            num_worlds,
+            self._engine.mj_model,
+            self._engine.num_envs,
             cam_res=[(view.width, view.height) for view in views],
             render_rgb=["rgb" in view.data_types for view in views],
             render_depth=["depth" in view.data_types for view in views],
@@ -179,8 +155,9 @@ class _Scene:
                     images[i].segmentation = pixels.unflatten(1, shape)
         return images
 
-    def render(self, model: Any, data: Any) -> dict[int, Images]:
+    def render(self) -> dict[int, Images]:
         """Render all views at the current poses."""
+        model, data = self._engine.wp_model, self._engine.wp_data
         if self.context is None:
             return self._images
         if self._dataid is not None:
@@ -190,7 +167,7 @@ class _Scene:
             mjwarp.refit_bvh(model, data, self.context)
             mjwarp.render(model, data, self.context)
 
-        self._launch(self._name, work, on_cpu=False)
+        self._engine.launch(self._name, work, on_cpu=False)
         for parts, rgb in self._packed:
             for channel in range(3):
                 rgb[..., channel] = parts[..., 2 - channel]
