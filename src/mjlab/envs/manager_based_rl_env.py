@@ -194,7 +194,8 @@ class ManagerBasedRlEnv:
         self._acts_between_substeps = self.action_manager.needs_substep or any(
             entity.needs_substep for entity in self.scene.entities.values()
         )
-        # Without anything that acts between substeps, the engine runs all of them in one go.
+        # Without anything that acts between substeps, the engine runs all of them in one go and
+        # records what sensors need of each.
         self._steps_as_one = not (
             self._acts_between_substeps
             or self.scene.needs_substep
@@ -335,8 +336,8 @@ class ManagerBasedRlEnv:
             self._sim_step_counter += substeps
             self.action_manager.apply_action()
             self.scene.write_data_to_sim()
-            self.sim.step(nstep=substeps)
-            self.scene.update(dt=self.step_dt)
+            recorded = self.sim.step(substeps, self.scene.recorded_fields)
+            self.scene.update(self.physics_dt, recorded, substeps)
             return
         for substep in range(substeps):
             self._sim_step_counter += 1

@@ -222,9 +222,20 @@ class Scene:
 
     @property
     def needs_substep(self) -> bool:
-        """Whether an actuator or a sensor has to act at every physics substep."""
-        parts = (*self._entities.values(), *self._sensors.values())
-        return any(part.needs_substep for part in parts)
+        """Whether an actuator or a sensor must be called at every physics substep.
+
+        Sensors with `recorded_fields` need not.
+        """
+        return any(entity.needs_substep for entity in self._entities.values()) or any(
+            sensor.needs_substep and not sensor.recorded_fields
+            for sensor in self._sensors.values()
+        )
+
+    @property
+    def recorded_fields(self) -> tuple[str, ...]:
+        """Data fields of which sensors need the values after every physics substep."""
+        fields = (field for sensor in self._sensors.values() for field in sensor.recorded_fields)
+        return tuple(dict.fromkeys(fields))
 
     def collect_variant_info(self) -> list[Any]:
         """Return the entities whose meshes differ between environments."""
@@ -276,12 +287,20 @@ class Scene:
         for sensor in self._updated_sensors:
             sensor.reset(env_ids)
 
-    def update(self, dt: float) -> None:
-        """Tell actuators and sensors that the simulation has advanced by `dt` seconds."""
+    def update(
+        self, dt: float, recorded: dict[str, torch.Tensor] | None = None, substeps: int = 1
+    ) -> None:
+        """Tell actuators and sensors that the simulation has advanced by `substeps` times `dt` s.
+
+        With more than one substep, `recorded` has the values of `recorded_fields` after each.
+        """
         for entity in self._entities.values():
-            entity.update(dt)
+            entity.update(substeps * dt)
         for sensor in self._updated_sensors:
-            sensor.update(dt)
+            if recorded is not None and sensor.recorded_fields:
+                sensor.update_recorded(recorded, dt)
+            else:
+                sensor.update(substeps * dt)
 
     def write_data_to_sim(self, env_ids: EnvIds = None) -> None:
         """Turn the entities' targets into controls; with `env_ids`, only in environments just reset."""

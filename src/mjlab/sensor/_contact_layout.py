@@ -51,11 +51,12 @@ class ContactLayout:
         }
 
     def found_first(self, block: torch.Tensor) -> torch.Tensor:
-        """Return the view (N, P) of `found` in the first slot of each primary.
+        """Return the view (..., P) of `found` in the first slot of each primary.
 
         Contacts fill the slots in order, so it tells whether there is any.
         """
-        return self.split(block)["found"][:, :: self.num_slots]
+        column, _ = self._columns["found"]
+        return block[..., column :: self.num_slots * self._width_of_slot]
 
 
 def to_world(vector: torch.Tensor, normal: torch.Tensor, tangent: torch.Tensor) -> torch.Tensor:

@@ -183,7 +183,7 @@ class ContactSensor(Sensor[ContactData]):
     that all reading and recording is of one block.
     """
 
-    _transient = {"_primary_names", "_layout", "_fields", "_records", "_source", "_found_view"}
+    _transient = {"_primary_names", "_layout", "_fields", "_records", "_source"}
 
     def __init__(self, cfg: ContactSensorCfg) -> None:
         super().__init__()
@@ -195,7 +195,6 @@ class ContactSensor(Sensor[ContactData]):
         self._layout = ContactLayout(self._fields, 0, cfg.num_slots)
         self._sim_data: Any = None
         self._source: torch.Tensor | None = None
-        self._found_view: torch.Tensor | None = None
         self._history: ContactHistory | None = None
         self._clocks: ContactClocks | None = None
 
@@ -208,6 +207,12 @@ class ContactSensor(Sensor[ContactData]):
     def needs_substep(self) -> bool:
         """Whether contacts between substeps count: for a history and for air time they do."""
         return self._records or self.cfg.track_air_time
+
+    @property
+    def recorded_fields(self) -> tuple[str, ...]:
+        """`sensordata`, for a history or air time; nothing if a subclass overrides `update`."""
+        overrides_update = type(self).update is not ContactSensor.update
+        return ("sensordata",) if self.needs_substep and not overrides_update else ()
 
     # Building.
 
@@ -273,7 +278,7 @@ class ContactSensor(Sensor[ContactData]):
         first = mj_model.sensor(self._element_name(self._primary_names[0]))
         self._layout.start = int(first.adr[0])
         self._sim_data = data
-        self._source = self._found_view = None
+        self._source = None
         num_envs = data.qpos.shape[0]
         if self._records:
             width = self._layout.width
@@ -290,10 +295,23 @@ class ContactSensor(Sensor[ContactData]):
     def update(self, dt: float) -> None:
         """Record what the last physics substep, of `dt` seconds, has measured."""
         self.invalidate_cache()
+        if self.needs_substep:
+            self._record(self._block()[None], dt)
+
+    def update_recorded(self, recorded: dict[str, torch.Tensor], dt: float) -> None:
+        """Record what several substeps, of `dt` seconds each, have measured."""
+        self.invalidate_cache()
+        start = self._layout.start
+        self._record(recorded["sensordata"][..., start : start + self._layout.width], dt)
+
+    def _record(self, blocks: torch.Tensor, dt: float) -> None:
+        """Add the blocks (substeps, N, width) to the history, and advance the clocks."""
         if self._history is not None:
-            self._history.record(self._block())
+            for block in blocks:
+                self._history.record(block)
         if self._clocks is not None:
-            self._clocks.update(self._found() > 0.0, dt)
+            for in_contact in self._layout.found_first(blocks) > 0.0:
+                self._clocks.update(in_contact, dt)
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
         """Clear history and clocks of these environments; None means all."""
@@ -313,12 +331,6 @@ class ContactSensor(Sensor[ContactData]):
             end = self._layout.start + self._layout.width
             self._source = self._sim_data.sensordata[:, self._layout.start : end]
         return self._source
-
-    def _found(self) -> torch.Tensor:
-        """Return the live (N, P) view of the number of contacts of each primary."""
-        if self._found_view is None:
-            self._found_view = self._layout.found_first(self._block())
-        return self._found_view
 
     def _compute_data(self) -> ContactData:
         # A copy, so that what a term keeps of one step does not change in the next.

@@ -46,7 +46,9 @@ class Sensor(ABC, Generic[T]):
     simulation's derived fields.
 
     A subclass computes its data in `_compute_data`. One that overrides `update`, because it keeps
-    a history, has to be updated at every physics substep.
+    a history, is updated at every physics substep. If all it needs of a substep is data fields, it
+    names them in `recorded_fields` and overrides `update_recorded` too, so that the engine can run
+    the substeps in one go.
     """
 
     _transient = {"_cached_data", "_cache_valid"}
@@ -88,6 +90,18 @@ class Sensor(ABC, Generic[T]):
     def update(self, dt: float) -> None:
         """Take note that the simulation has advanced by `dt` seconds."""
         self.invalidate_cache()
+
+    @property
+    def recorded_fields(self) -> tuple[str, ...]:
+        """Data fields whose values after every substep `update_recorded` takes; none by default."""
+        return ()
+
+    def update_recorded(self, recorded: dict[str, torch.Tensor], dt: float) -> None:
+        """Do what `update` would have done after each of several substeps of `dt` seconds.
+
+        `recorded` has the values of `recorded_fields` after every substep, (substeps, N, ...).
+        """
+        raise NotImplementedError(f"{type(self).__name__} records {self.recorded_fields}.")
 
     @property
     def needs_substep(self) -> bool:

@@ -255,8 +255,12 @@ class Engine(ABC):
         """
 
     @abstractmethod
-    def step(self, nstep: int) -> None:
-        """Advance all environments by `nstep` physics steps."""
+    def step(self, nstep: int, record: tuple[str, ...] = ()) -> dict[str, torch.Tensor]:
+        """Advance all environments by `nstep` physics steps.
+
+        Returns:
+            Values of the data fields in `record` after every step, (nstep, N, ...).
+        """
 
     @abstractmethod
     def forward(self, env_ids: torch.Tensor | None, stage: Stage = "acc") -> None:
@@ -342,7 +346,14 @@ class Engine(ABC):
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned; derived fields are current afterwards."""
+        """Restore what `state_dict` returned.
+
+        Positions, velocities and their sensors are current afterwards, quantities of the
+        acceleration stage as they were saved.
+
+        Raises:
+            ValueError: the state is of another version of the engine, or of another size.
+        """
 
     def close(self) -> None:  # noqa: B027 - optional hook: most engines hold nothing to free.
         """Free what the engine holds outside Python's reach."""

@@ -396,14 +396,19 @@ class Simulation:
 
     # Physics.
 
-    def step(self, nstep: int = 1) -> None:
-        """Advance all environments by `nstep` substeps, in one dispatch."""
+    def step(self, nstep: int = 1, record: tuple[str, ...] = ()) -> dict[str, torch.Tensor]:
+        """Advance all environments by `nstep` substeps, in one dispatch.
+
+        Returns:
+            Values of the data fields in `record` after every substep, (nstep, N, ...).
+        """
         if not self.nan_guard.enabled:
-            self._engine.step(nstep)
-            return
+            return self._engine.step(nstep, record)
+        recorded = []
         for _ in range(nstep):
             with self.nan_guard.watch(self._data):
-                self._engine.step(1)
+                recorded.append(self._engine.step(1, record))
+        return {name: torch.cat([step[name] for step in recorded]) for name in record}
 
     def forward(self, env_ids: EnvIds = None, stage: Stage = "acc") -> None:
         """Make derived fields up to a stage current with the state, without advancing time.

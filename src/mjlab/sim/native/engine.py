@@ -12,6 +12,7 @@ import copy
 import functools
 import logging
 import warnings
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -34,8 +35,6 @@ from mjlab.sim.field_lists import (
     INPUTS,
     RESULTS_ZERO_ON_RESET,
 )
-from mjlab.sim.native.midphase import FIELDS as MIDPHASE_FIELDS
-from mjlab.sim.native.midphase import MidphaseMargins
 from mjlab.sim.native.rays import NativeRays
 from mjlab.sim.native.render import NativeRenderer, render_problem
 from mjlab.sim.sensor_fed import refuse_without_sensor
@@ -73,7 +72,13 @@ _FREE_INTEGERS = frozenset(
     | {"jnt_limited", "tendon_limited", "jnt_actfrclimited", "tendon_actfrclimited"}
     | {"actuator_ctrllimited", "actuator_forcelimited", "actuator_actlimited"}
 )
-_DERIVED_BY_ENGINE = frozenset({"body_margin"})
+
+# Model fields from which mj_setConst computes the bounding volumes of the midphase, its results.
+_BOUNDED = (
+    *("geom_size", "geom_pos", "geom_quat", "geom_aabb", "geom_margin", "geom_gap"),
+    *("body_ipos", "body_iquat"),
+)
+_BOUNDING_VOLUMES = ("bvh_aabb", "body_margin")
 
 _STAGES = {
     "pos": int(mujoco.mjtStage.mjSTAGE_POS),
@@ -102,23 +107,26 @@ class NativeEngine(Engine):
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         # `Batch` would take every core of the machine by itself.
         threads = cfg.num_threads or min(cores_per_process(), num_envs)
-        sleeps = self._model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         try:
-            self._batch = Batch(self._model, num_envs, threads, persistent=bool(sleeps))
+            self._batch = self._make_batch(self._model, num_envs, threads)
         except (ValueError, RuntimeError) as error:
             raise EngineUnavailableError(
                 f"The native engine refuses this model: {error}. Use --engine warp."
             ) from error
         self._rows = torch.from_numpy(self._batch.state)
         self._warm_start = _state_slice(self._model, mujoco.mjtState.mjSTATE_WARMSTART)
-        self._inputs: dict[str, _Copy] = {}
+        self._inputs: dict[str, _Input] = {}
         self._outputs: dict[str, _Copy] = {}
         self._tensors: dict[str, torch.Tensor] = {}
-        self._model_copies: dict[str, _Copy] = {}
+        self._model_copies: dict[str, _Input] = {}
         self._model_tensors: dict[str, torch.Tensor] = {}
-        self._sensor_columns = _columns_before_acceleration(self._model)
+        # (nsensordata,) columns of `sensordata` that a stage computes.
+        stages = np.repeat(self._model.sensor_needstage, self._model.sensor_dim)
+        self._sensor_columns = {
+            name: torch.from_numpy(stages <= value) for name, value in _STAGES.items()
+        }
         self._frame_marks: dict[str, np.ndarray] = {}
-        self._midphase: MidphaseMargins | None = None
+        self._bounds: Batch | None = None
         self._before: torch.Tensor | None = None
         self._first_steps = _FIRST_STEPS
         self._has_warned = False
@@ -145,10 +153,10 @@ class NativeEngine(Engine):
             refuse_without_sensor(self._model, name)
             source = _as_tensor(self._batch.bind(name))
             dtype = torch.bool if name == "eq_active" else _seam_type(source)
-            field = _Copy(source, dtype)
             if name in INPUTS:
-                self._inputs[name] = field
+                field = self._inputs[name] = _Input(source, dtype)
             else:
+                field = _Copy(source, dtype)
                 self._fill(field)
                 self._outputs[name] = field
             self._tensors[name] = _like_mujoco(name, field.values)
@@ -193,11 +201,9 @@ class NativeEngine(Engine):
                     self._frame_marks[mark][:] = 0
             values = _as_tensor(self._batch.expand(self._model_name(name)))
             if _seam_type(values) != values.dtype:
-                self._model_copies[name] = _Copy(values, _seam_type(values))
+                self._model_copies[name] = _Input(values, _seam_type(values))
                 values = self._model_copies[name].values
             self._model_tensors[name] = _like_mujoco(name, values)
-            if name in MIDPHASE_FIELDS and self._midphase is None:
-                self._midphase = MidphaseMargins(self._model, self.num_envs, self._batch.expand)
 
     @staticmethod
     def _model_name(name: str) -> str:
@@ -209,7 +215,7 @@ class NativeEngine(Engine):
             raise ValueError(f"The native engine: {_reason(self._batch.expand, name)}.")
         value = getattr(self._model, name, None)
         counts = isinstance(value, np.ndarray) and value.dtype.kind in "iub"
-        if (counts and name not in _FREE_INTEGERS) or name in _DERIVED_BY_ENGINE:
+        if (counts and name not in _FREE_INTEGERS) or name in _BOUNDING_VOLUMES:
             raise ValueError(
                 f"Model field {name!r} is part of the model's structure and cannot differ between "
                 "environments. Use several entities, or several tasks."
@@ -236,21 +242,29 @@ class NativeEngine(Engine):
 
     # Physics.
 
-    def step(self, nstep: int) -> None:
-        self._copy_in()
-        if self._first_steps and nstep:
+    def step(self, nstep: int, record: tuple[str, ...] = ()) -> dict[str, torch.Tensor]:
+        fields = {name: self.data_field(name) for name in record}
+        recorded = {name: field.new_empty(nstep, *field.shape) for name, field in fields.items()}
+        if nstep == 0:
+            return recorded
+        # Not `Batch.rollout`: it stops environments that warn, and single steps are as fast.
+        calls = [1] * nstep if record else [nstep]
+        if self._first_steps:
             self._first_steps -= 1
-            if nstep > 1:
-                self._call(self._batch.step, nstep=nstep - 1)
-            self._before = self._rows.clone()
-            self._call(self._batch.step)
-        else:
-            self._before = None
-            self._call(self._batch.step, nstep=nstep)
-        for name in self._inputs.keys() & _ADVANCED:
-            self._inputs[name].copy_out()
-        for field in self._outputs.values():
-            field.copy_out()
+            calls = [1] * nstep if record else [nstep - 1, 1][nstep == 1 :]
+        self._copy_in()
+        for k, count in enumerate(calls):
+            is_last = k == len(calls) - 1
+            self._before = self._rows.clone() if is_last and self._first_steps else None
+            rows = self._call(self._batch.step, nstep=count)
+            for name in self._outputs if is_last else self._outputs.keys() & recorded.keys():
+                self._outputs[name].copy_out(rows)
+            for name in self._inputs.keys() & _ADVANCED:
+                if is_last or name in recorded:
+                    self._inputs[name].copy_out()
+            for name, values in recorded.items():
+                values[k] = fields[name]
+        return recorded
 
     def forward(self, env_ids: torch.Tensor | None, stage: Stage = "acc") -> None:
         if self._before is not None:
@@ -260,28 +274,43 @@ class NativeEngine(Engine):
         if not self._outputs:
             return
         self._copy_in()
-        self._call(self._batch.forward, _as_ids(env_ids), stage=_STAGES[stage])
-        if stage == "acc":
-            if "qacc_warmstart" in self._inputs:
-                self._inputs["qacc_warmstart"].copy_out(env_ids)
-            for field in self._outputs.values():
-                field.copy_out(env_ids)
-            return
-        # An `MjData` serves many simulations: what this stage does not compute is another's.
+        rows = self._call(self._batch.forward, env_ids, stage=_STAGES[stage])
+        if stage == "acc" and "qacc_warmstart" in self._inputs:
+            self._inputs["qacc_warmstart"].copy_out(env_ids)
+        # An `MjData` serves many environments: what a stage does not compute is another's.
         for name, field in self._outputs.items():
-            if name == "sensordata":
-                field.copy_out(env_ids, self._sensor_columns[stage])
-            elif name not in ACCELERATION_FIELDS:
-                field.copy_out(env_ids)
+            if stage == "acc" or name not in (*ACCELERATION_FIELDS, "sensordata"):
+                field.copy_out(rows)
+            elif name == "sensordata":
+                field.copy_out(rows, self._sensor_columns[stage])
 
     def reset(self, env_ids: torch.Tensor | None) -> None:
         self._copy_in_model()
-        self._batch.reset(_as_ids(env_ids), stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        self._call(self._batch.reset, env_ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
         for field in self._inputs.values():
             field.copy_out(env_ids)
-        rows: Any = slice(None) if env_ids is None else env_ids
         for name in RESULTS_ZERO_ON_RESET & self._outputs.keys():
-            self._outputs[name].values[rows] = 0
+            self._outputs[name].values[slice(None) if env_ids is None else env_ids] = 0
+
+    def _call(
+        self, method: Callable[..., None], env_ids: torch.Tensor | None = None, **options: int
+    ) -> torch.Tensor | None:
+        """Run a method of the batch; return the environments in which MuJoCo did not raise.
+
+        None means all. The others keep their state, with which they would raise for ever. So their
+        `qpos` and `qvel` become NaN, by which the environment finds and resets them.
+        """
+        try:
+            method(None if env_ids is None else env_ids.numpy(), **options)
+            return env_ids
+        except SimulationError as error:
+            if not self._has_warned:
+                self._has_warned = True
+                logger.warning("%s. Diverged environments are set to NaN.", error)
+            for name in ("qpos", "qvel"):
+                self._batch.bind(name)[error.ids] = np.nan
+            ids = np.arange(self.num_envs) if env_ids is None else env_ids.numpy()
+            return torch.from_numpy(np.setdiff1d(ids, error.ids))
 
     def _copy_in(self) -> None:
         """Pass on what was written into state and model fields since the last call."""
@@ -290,24 +319,26 @@ class NativeEngine(Engine):
         self._copy_in_model()
 
     def _copy_in_model(self) -> None:
-        for field in self._model_copies.values():
-            field.copy_in_if_versioned()
-        if self._midphase is not None:
-            self._midphase.refresh(self._model_tensors)
+        written = {
+            name: field.copy_in() for name, field in self._model_copies.items() if field.is_versioned()
+        }
+        moved = [rows for name, rows in written.items() if name in _BOUNDED and rows is not None]
+        if moved:
+            self._fit_bounding_volumes(torch.cat(moved).unique())
 
-    def _call(self, method: Any, *args: Any, **options: Any) -> None:
-        """Run a call of the batch; environments in which MuJoCo raises become NaN.
+    def _fit_bounding_volumes(self, env_ids: torch.Tensor | None) -> None:
+        """Fit the boxes of the midphase, by which contacts are found, to geoms that were written.
 
-        They keep the state they had, so they would stand still; as NaN they count as diverged.
+        MuJoCo does this in mj_setConst, which would also replace the constants that are up to
+        `recompute_constants`. So a batch beside it computes the boxes.
         """
-        try:
-            method(*args, **options)
-        except SimulationError as error:
-            if not self._has_warned:
-                self._has_warned = True
-                logger.warning("%s. Diverged environments are set to NaN.", error)
-            for name in ("qpos", "qvel"):
-                self._batch.bind(name)[error.ids] = np.nan
+        if self._bounds is None:
+            self._bounds = self._make_batch(self._model, self.num_envs)
+        for name in self._model_copies.keys() & _BOUNDED:
+            self._bounds.expand(name)[:] = self._batch.expand(name)
+        self._call(self._bounds.set_const, env_ids)
+        for name in _BOUNDING_VOLUMES:
+            self._batch.expand(name)[:] = self._bounds.expand(name)
 
     def constants_written_by(self, level: int) -> tuple[str, ...]:
         if level == 0:
@@ -319,8 +350,8 @@ class NativeEngine(Engine):
         self.expand(self.constants_written_by(level))
         self._copy_in()
         self._before = None
-        self._call(self._batch.set_const, _as_ids(env_ids))
-        # It also marks anew which frames coincide now, and these may be moved apart after it.
+        self._call(self._batch.set_const, env_ids)
+        # It also marks frames that coincide, which may be moved apart afterwards.
         for mark in self._frame_marks.values():
             mark[:] = 0
         for name in self.constants_written_by(level):
@@ -379,8 +410,11 @@ class NativeEngine(Engine):
     def _make_batch(
         self, model: mujoco.MjModel, count: int, num_threads: int | None = None
     ) -> Batch:
-        """Make simulations of another model, for what is asked of this one."""
-        return Batch(model, count, num_threads or self._batch.nthread)
+        """Return `count` simulations of a model."""
+        # Sleep needs an `MjData` for each. Elsewhere that costs memory (0.23 MB a Go1) and saves
+        # nothing: 0.97 to 1.02 of the time of Go1 and G1, with 256 to 4,096 environments.
+        sleeps = model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        return Batch(model, count, num_threads or self._batch.nthread, persistent=bool(sleeps))
 
     def jacobian(
         self, points: torch.Tensor, body_ids: torch.Tensor
@@ -441,14 +475,13 @@ class NativeEngine(Engine):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         if state.get("library") != "mujoco.batch":
             raise ValueError(
-                "The saved simulation is of the native engine before mujoco.batch, from which no "
-                "run can continue exactly."
+                "The saved simulation is of the native engine before mujoco.batch and cannot be "
+                "continued exactly; start a new run from its weights."
             )
-        saved = state["state"]
-        if saved.shape != self._rows.shape:
+        if state["state"].shape != self._rows.shape:
             raise ValueError(
-                f"The saved simulation has {saved.shape[0]} environments with {saved.shape[1]} "
-                f"state values each; this one has {self._rows.shape[0]} with {self._rows.shape[1]}."
+                f"The saved simulation: expected {tuple(self._rows.shape)} state values, got "
+                f"{tuple(state['state'].shape)}; use the task and --num-envs that it was saved with."
             )
         self._before = None
         for name in state["bound"]:
@@ -460,7 +493,9 @@ class NativeEngine(Engine):
                 self._model_copies[name].copy_out()
             else:
                 self._model_tensors[name].copy_(value)
-        self._rows.copy_(saved)
+        if not self._model_copies.keys().isdisjoint(_BOUNDED):
+            self._fit_bounding_volumes(None)
+        self._rows.copy_(state["state"])
         for field in self._inputs.values():
             field.copy_out()
         self.forward(None, "vel")
@@ -469,7 +504,7 @@ class NativeEngine(Engine):
 
 
 class _Copy:
-    """A copy of a double-precision field in the type that crosses the seam."""
+    """Copy of an output in the type that crosses the seam."""
 
     def __init__(self, source: torch.Tensor, dtype: torch.dtype) -> None:
         # A field may be read for the first time under `inference_mode`, whose tensors count no
@@ -477,55 +512,48 @@ class _Copy:
         with torch.inference_mode(False):
             self.source = source
             self.values = source.to(dtype, copy=True, memory_format=torch.contiguous_format)
-            self._seen = self.values.clone()
-            self._version = self.values._version
 
-    def copy_in(self) -> None:
-        """Copy elements that were written into the source; others keep their precision."""
-        if torch.equal(self.values, self._seen):
+    def copy_out(self, rows: torch.Tensor | None = None, columns: torch.Tensor | None = None) -> None:
+        """Copy the source out: all of it, or `rows`, or `columns` ((size,) bool) of a matrix."""
+        if rows is None and columns is None:
+            self.values.copy_(self.source)
             return
+        index = slice(None) if rows is None else rows
+        new = self.source[index].to(self.values.dtype)
+        self.values[index] = new if columns is None else new.where(columns, self.values[index])
+
+
+class _Input(_Copy):
+    """Copy of a state or model field. Only elements that were written are passed on.
+
+    So elements that nobody writes keep the double precision of their source.
+    """
+
+    def __init__(self, source: torch.Tensor, dtype: torch.dtype) -> None:
+        super().__init__(source, dtype)
+        with torch.inference_mode(False):
+            self._seen = self.values.clone()
+        self._version = self.values._version
+
+    def is_versioned(self) -> bool:
+        """Return True if torch counted a write since the last call; misses those through numpy."""
+        seen, self._version = self._version, self.values._version
+        return self._version != seen
+
+    def copy_in(self) -> torch.Tensor | None:
+        """Copy elements that were written into the source; return their rows, None without any."""
+        if torch.equal(self.values, self._seen):
+            return None
         written = self.values != self._seen
         torch.where(written, self.values.to(self.source.dtype), self.source, out=self.source)
         self._seen.copy_(self.values)
-
-    def copy_in_if_versioned(self) -> None:
-        """Do the same if torch has counted a write, without looking at the elements otherwise."""
-        if self.values._version != self._version:
-            self.copy_in()
-            self._version = self.values._version
+        return written.flatten(1).any(dim=1).nonzero().flatten()
 
     def copy_out(self, rows: torch.Tensor | None = None, columns: torch.Tensor | None = None) -> None:
-        """Copy the source out: all of it, or some rows, or some columns of a matrix."""
-        if columns is not None:
-            values = self.source.index_select(1, columns)
-            target = self.values if rows is None else None
-            if target is not None:
-                target.index_copy_(1, columns, values.to(target.dtype))
-            else:
-                self.values[rows[:, None], columns] = values[rows].to(self.values.dtype)
-        elif rows is None:
-            self.values.copy_(self.source)
-            self._seen.copy_(self.values)
-        else:
-            self.values.index_copy_(0, rows, self.source.index_select(0, rows).to(self.values.dtype))
-            self._seen.index_copy_(0, rows, self.values.index_select(0, rows))
+        super().copy_out(rows, columns)
+        index = slice(None) if rows is None else rows
+        self._seen[index] = self.values[index]
         self._version = self.values._version
-
-
-def _columns_before_acceleration(model: mujoco.MjModel) -> dict[str, torch.Tensor]:
-    """Return by stage the columns of `sensordata` that it makes current."""
-    columns = {}
-    for stage, value in _STAGES.items():
-        chosen = [
-            np.arange(adr, adr + dim)
-            for adr, dim, need in zip(
-                model.sensor_adr, model.sensor_dim, model.sensor_needstage, strict=True
-            )
-            if need <= value
-        ]
-        flat = np.concatenate(chosen) if chosen else np.zeros(0, dtype=np.int64)
-        columns[stage] = torch.from_numpy(flat.astype(np.int64))
-    return columns
 
 
 def _seam_type(source: torch.Tensor) -> torch.dtype:
@@ -559,7 +587,3 @@ def _state_slice(model: mujoco.MjModel, component: mujoco.mjtState) -> slice:
     before = int(mujoco.mjtState.mjSTATE_INTEGRATION) & (int(component) - 1)
     start = mujoco.mj_stateSize(model, before)
     return slice(start, start + mujoco.mj_stateSize(model, int(component)))
-
-
-def _as_ids(env_ids: torch.Tensor | None) -> np.ndarray[Any, Any] | None:
-    return None if env_ids is None else np.ascontiguousarray(env_ids.numpy())

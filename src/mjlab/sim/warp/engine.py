@@ -419,9 +419,17 @@ class WarpEngine(Engine):
 
     # Physics.
 
-    def step(self, nstep: int) -> None:
-        self.launch("step", self._substep, nstep)
+    def step(self, nstep: int, record: tuple[str, ...] = ()) -> dict[str, torch.Tensor]:
+        fields = {name: self.data_field(name) for name in record}
+        recorded = {name: field.new_empty(nstep, *field.shape) for name, field in fields.items()}
+        if not record:
+            self.launch("step", self._substep, nstep)
+        for k in range(nstep if record else 0):
+            self.launch("step", self._substep)
+            for name, field in fields.items():
+                recorded[name][k] = field
         self._overflow.tick()
+        return recorded
 
     def _substep(self) -> None:
         self._refresh_velocities()
