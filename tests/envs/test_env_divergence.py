@@ -127,3 +127,112 @@ def test_the_nan_guard_dumps_what_led_to_the_nan(tmp_path):
     assert len(dumps) == 1
     with np.load(dumps[0]) as dump:
         assert len(dump.files) > 1
+
+
+# A robot on rough ground, where MuJoCo raises for what it cannot collide.
+
+
+@pytest.fixture(scope="module")
+def walkers():
+    """Go1s on rough ground with a pyramidal cone, a state of theirs, and how they go on from it."""
+    cfg = load_env_cfg("Mjlab-Velocity-Rough-Unitree-Go1")
+    cfg.scene.num_envs, cfg.seed, cfg.sim.engine = NUM_ENVS, 5, "native"
+    cfg.sim.mujoco.cone = "pyramidal"
+    cfg.scene.terrain.terrain_generator.num_rows = 2
+    cfg.scene.terrain.terrain_generator.num_cols = 2
+    # A reset draws random numbers, which must not reach the other environments.
+    for group in cfg.observations.values():
+        group.enable_corruption = False
+    cfg.events.pop("push_robot", None)
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    env.reset()
+    for _ in range(2):
+        env.step(torch.zeros(NUM_ENVS, env.action_manager.total_action_dim))
+    saved = env.state_dict()
+    yield env, saved, walk(env, saved)
+    env.close()
+
+
+def walk(env, saved, poison=lambda: None) -> list[torch.Tensor]:
+    """Return states, rewards and observations of 3 steps, with `poison()` before the second."""
+    env.load_state_dict(saved)
+    record = []
+    for k in range(3):
+        if k == 1:
+            poison()
+        action = torch.full((NUM_ENVS, env.action_manager.total_action_dim), 0.3)
+        observations, reward, *_ = env.step(action)
+        parts = (env.sim.data.qpos, env.sim.data.qvel, reward, *observations.values())
+        record += [part.clone() for part in parts]
+    return record
+
+
+def assert_contained(env, expected: list[torch.Tensor], found: list[torch.Tensor]) -> None:
+    """Check that only the broken environment noticed, and that it is sound again."""
+    for one, other in zip(expected, found, strict=True):
+        assert torch.equal(one[OTHERS], other[OTHERS])
+    assert all(torch.isfinite(part).all() for part in found[-4:])
+    assert env.episode_length_buf[BROKEN] < env.episode_length_buf[OTHERS[0]]
+
+
+def poison_state(env, field: str, value: float) -> None:
+    getattr(env.sim.data, field)[BROKEN] = value
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e12])
+@pytest.mark.parametrize("field", ["qpos", "qvel", "xfrc_applied"])
+def test_what_mujoco_raises_for_one_environment_never_ends_the_run(walkers, field, value):
+    env, saved, expected = walkers
+    found = walk(env, saved, lambda: poison_state(env, field, value))
+    assert_contained(env, expected, found)
+    assert env._nan_resets[BROKEN] == saved["buffers"]["_nan_resets"][BROKEN] + 1
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e12])
+def test_controls_that_are_not_finite_are_contained(walkers, value):
+    env, saved, _ = walkers
+    states = []
+    for ctrl in (0.0, value):
+        env.load_state_dict(saved)
+        env.sim.data.ctrl[BROKEN] = ctrl
+        env.sim.step(8, ("sensordata",))
+        env.sim.forward()
+        states.append(torch.cat((env.sim.data.qpos, env.sim.data.qvel, env.sim.data.cvel.flatten(1)), 1))
+    assert torch.equal(states[0][OTHERS], states[1][OTHERS])
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e12])
+@pytest.mark.parametrize("path", ["single", "forward", "sense", "recompute", "reset_other"])
+def test_every_call_contains_what_mujoco_raises(walkers, monkeypatch, path, value):
+    env, saved, expected = walkers
+    monkeypatch.setattr(env, "_steps_as_one", path != "single")
+    calls = {
+        "single": lambda: None,
+        "forward": lambda: [env.sim.forward(stage=stage) for stage in ("pos", "vel", "acc")],
+        "sense": env.sim.sense,
+        "recompute": lambda: env.sim.recompute_constants(3),
+        "reset_other": lambda: env.sim.forward(torch.tensor([0, BROKEN])),
+    }
+    if path == "recompute":  # It changes constants of all environments.
+        expected = walk(env, saved, calls[path])
+    found = walk(env, saved, lambda: (poison_state(env, "qpos", value), calls[path]()))
+    assert_contained(env, expected, found)
+
+
+def test_outputs_of_a_diverged_environment_do_not_depend_on_threads():
+    """They keep their values, because MuJoCo computed none."""
+    results = []
+    for threads in (1, 2):
+        cfg = load_env_cfg("Mjlab-Velocity-Flat-Unitree-Go1")
+        cfg.scene.num_envs, cfg.seed, cfg.sim.num_threads = NUM_ENVS, 5, threads
+        cfg.sim.mujoco.cone = "pyramidal"
+        env = ManagerBasedRlEnv(cfg, device="cpu")
+        env.reset()
+        sim = env.sim
+        sim.step(4)
+        sim.forward(stage="vel")
+        sim.data.qpos[BROKEN, 2:] = 1e12
+        sim.step(4)
+        results.append(torch.cat((sim.data.sensordata, sim.data.cvel.flatten(1)), 1)[BROKEN])
+        env.close()
+    assert torch.equal(*(torch.nan_to_num(result, nan=-1.0) for result in results))

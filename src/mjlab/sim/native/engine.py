@@ -319,12 +319,14 @@ class NativeEngine(Engine):
         self._copy_in_model()
 
     def _copy_in_model(self) -> None:
-        written = {
-            name: field.copy_in() for name, field in self._model_copies.items() if field.is_versioned()
-        }
-        moved = [rows for name, rows in written.items() if name in _BOUNDED and rows is not None]
-        if moved:
-            self._fit_bounding_volumes(torch.cat(moved).unique())
+        moved = None
+        for name, field in self._model_copies.items():
+            written = field.copy_in() if field.is_versioned() else None
+            if written is not None and name in _BOUNDED:
+                rows = written.flatten(1).any(dim=1)
+                moved = rows if moved is None else moved | rows
+        if moved is not None:
+            self._fit_bounding_volumes(moved.nonzero().flatten())
 
     def _fit_bounding_volumes(self, env_ids: torch.Tensor | None) -> None:
         """Fit the boxes of the midphase, by which contacts are found, to geoms that were written.
@@ -412,7 +414,7 @@ class NativeEngine(Engine):
     ) -> Batch:
         """Return `count` simulations of a model."""
         # Sleep needs an `MjData` for each. Elsewhere that costs memory (0.23 MB a Go1) and saves
-        # nothing: 0.97 to 1.02 of the time of Go1 and G1, with 256 to 4,096 environments.
+        # nothing: 0.97 to 1.08 of the time of Go1 and G1, with 256 to 4,096 environments.
         sleeps = model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         return Batch(model, count, num_threads or self._batch.nthread, persistent=bool(sleeps))
 
@@ -541,13 +543,13 @@ class _Input(_Copy):
         return self._version != seen
 
     def copy_in(self) -> torch.Tensor | None:
-        """Copy elements that were written into the source; return their rows, None without any."""
+        """Copy elements that were written into the source; return a mask of them, None if none."""
         if torch.equal(self.values, self._seen):
             return None
         written = self.values != self._seen
         torch.where(written, self.values.to(self.source.dtype), self.source, out=self.source)
         self._seen.copy_(self.values)
-        return written.flatten(1).any(dim=1).nonzero().flatten()
+        return written
 
     def copy_out(self, rows: torch.Tensor | None = None, columns: torch.Tensor | None = None) -> None:
         super().copy_out(rows, columns)

@@ -1,0 +1,268 @@
+"""Laws of the native engine: what crosses the seam, recorded substeps, sleep."""
+
+from __future__ import annotations
+
+import copy
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mjlab.sim import MujocoCfg, Simulation, SimulationCfg
+
+NUM_ENVS = 3
+SCENE = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="5 5 .1"/>
+    <body name="trunk" pos="0 0 .3">
+      <freejoint/>
+      <geom type="box" size=".2 .1 .05" mass="2"/>
+      <site name="center"/>
+      <body pos="0 0 -.05">
+        <joint name="knee" axis="0 1 0" damping=".1"/>
+        <geom type="capsule" size=".03" fromto="0 0 0 .1 0 -.2" mass=".3"/>
+      </body>
+    </body>
+    <body name="hand" mocap="true" pos="1 0 1"><geom size=".02" contype="0" conaffinity="0"/></body>
+  </worldbody>
+  <actuator><motor joint="knee"/></actuator>
+  <sensor>
+    <accelerometer name="acc" site="center"/>
+    <framepos name="pos" objtype="site" objname="center"/>
+    <contact name="touch" subtree1="trunk" data="found force"/>
+  </sensor>
+</mujoco>
+"""
+WRITABLE = ("qpos", "qvel", "ctrl", "xfrc_applied", "mocap_pos", "qfrc_applied")
+
+
+def build(num_threads: int = 1, scene: str = SCENE, **options) -> Simulation:
+    cfg = SimulationCfg(mujoco=MujocoCfg(timestep=0.004, **options), num_threads=num_threads)
+    spec = mujoco.MjSpec.from_string(scene)
+    return Simulation(NUM_ENVS, cfg, spec=spec, device="cpu")
+
+
+# Writes.
+
+ONE_WRITE = st.tuples(
+    st.sampled_from(WRITABLE),
+    st.sampled_from(("element", "row", "column", "whole", "add", "numpy", "inference", "same")),
+    st.integers(0, NUM_ENVS - 1),
+    st.floats(-0.5, 0.5, width=32),
+)
+
+
+def write(field: torch.Tensor, kind: str, env: int, value: float) -> None:
+    """Write `value` into some elements of a field (N, ...), in one of many ways."""
+    flat = field.view(NUM_ENVS, -1)
+    if kind == "element":
+        flat[env, -1] = value
+    elif kind == "row":
+        flat[env] = torch.full((flat.shape[1],), value)
+    elif kind == "column":
+        flat[:, -1:] = value
+    elif kind == "whole":
+        field.copy_(torch.full_like(field, value))
+    elif kind == "add":
+        field[env] += value
+    elif kind == "numpy":
+        field.numpy()[env] = value
+    elif kind == "inference":
+        with torch.inference_mode():
+            field.select(0, env).fill_(value)
+    elif kind == "same":
+        # Not a change: the double in the row must survive it.
+        field.copy_(field.clone())
+
+
+@settings(max_examples=30, deadline=None)
+@given(script=st.lists(st.lists(ONE_WRITE, max_size=4), min_size=1, max_size=4))
+def test_only_written_elements_reach_the_rows(script) -> None:
+    """The engine equals a loop over `MjData` that gets the written elements and nothing else."""
+    sim = build()
+    model = copy.copy(sim.mj_model)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    hosts = [mujoco.MjData(model) for _ in range(NUM_ENVS)]
+    fields = {name: getattr(sim.data, name) for name in WRITABLE}
+    for writes in script:
+        for name, kind, env, value in writes:
+            before = fields[name].numpy().copy()
+            write(fields[name], kind, env, value)
+            after = fields[name].numpy()
+            for host, old, new in zip(hosts, before, after, strict=True):
+                changed = (old != new).reshape(getattr(host, name).shape)
+                getattr(host, name)[changed] = new.reshape(changed.shape)[changed]
+        sim.step(3)
+        for host in hosts:
+            for _ in range(3):
+                mujoco.mj_step(model, host)
+    for env, host in enumerate(hosts):
+        found = sim.copy_to_host(env)
+        assert np.array_equal(found.qpos, host.qpos)
+        assert np.array_equal(found.qvel, host.qvel)
+
+
+def test_a_model_field_that_is_not_written_keeps_its_double_precision() -> None:
+    plain, expanded = build(), build()
+    expanded.expand_model_fields(("body_mass", "geom_pos", "geom_friction", "qpos0"))
+    expanded.model.geom_friction[1, 0, 0] = 0.5
+    for sim in (plain, expanded):
+        sim.step(60)
+    assert torch.equal(plain.data.qpos[[0, 2]], expanded.data.qpos[[0, 2]])
+
+
+# Recorded substeps.
+
+
+@pytest.mark.parametrize("engine", ["native", "warp"])
+@pytest.mark.parametrize("guarded", [False, True])
+def test_recorded_substeps_are_those_of_single_steps(engine: str, guarded: bool, tmp_path) -> None:
+    fields = ("sensordata", "qpos", "xmat")
+    sims = []
+    for _ in range(2):
+        cfg = SimulationCfg(engine=engine, mujoco=MujocoCfg(timestep=0.004))
+        cfg.nan_guard.enabled, cfg.nan_guard.output_dir = guarded, str(tmp_path)
+        spec = mujoco.MjSpec.from_string(SCENE)
+        sims.append(Simulation(NUM_ENVS, cfg, spec=spec, device="cpu"))
+        sims[-1].data.qvel[:, 0] = torch.tensor([0.0, 0.5, 1.0])
+        sims[-1].data.qpos[1, 2] = 0.25
+    together, one_by_one = sims
+    for _ in range(4):
+        recorded = together.step(4, fields)
+        singles = []
+        for _ in range(4):
+            one_by_one.step()
+            singles.append({name: getattr(one_by_one.data, name).clone() for name in fields})
+        for name in fields:
+            expected = torch.stack([single[name] for single in singles])
+            assert recorded[name].dtype == expected.dtype
+            assert torch.equal(recorded[name], expected), name
+        for name in (*fields, "qvel", "xpos"):
+            assert torch.equal(getattr(together.data, name), getattr(one_by_one.data, name))
+
+
+def test_an_environment_that_warns_goes_on_while_its_substeps_are_recorded() -> None:
+    """`Batch.rollout` would leave it where MuJoCo warned."""
+    together, one_by_one = build(), build()
+    for sim in (together, one_by_one):
+        sim.data.ctrl[1] = float("nan")
+    recorded = together.step(4, ("qpos",))["qpos"]
+    one_by_one.step(4)
+    assert together._engine._batch.warning[1, int(mujoco.mjtWarning.mjWARN_BADCTRL)].any()
+    assert (recorded[1:, 1, 2] < recorded[:-1, 1, 2]).all(), "the trunk has to keep falling"
+    assert torch.equal(together.data.qpos, one_by_one.data.qpos)
+
+
+def test_no_substeps_change_nothing() -> None:
+    sim = build()
+    sim.step(3)
+    before = {name: getattr(sim.data, name).clone() for name in ("qpos", "sensordata", "xpos")}
+    sim.forward(stage="pos")
+    before = {name: getattr(sim.data, name).clone() for name in before}
+    assert sim.step(0, ("qpos",))["qpos"].shape == (0, NUM_ENVS, sim.mj_model.nq)
+    for name, values in before.items():
+        assert torch.equal(getattr(sim.data, name), values)
+
+
+# Stages.
+
+
+def test_an_earlier_stage_leaves_quantities_of_the_acceleration_stage() -> None:
+    sim = build(num_threads=2)
+    acc = slice(0, 3)
+    _ = sim.data.sensordata, sim.data.qacc
+    sim.data.qvel[:, 0] = torch.tensor([0.0, 0.5, 1.0])
+    sim.step(30)
+    sensordata, qacc = sim.data.sensordata.clone(), sim.data.qacc.clone()
+    sim.forward(stage="vel")
+    assert torch.equal(sim.data.qacc, qacc)
+    assert torch.equal(sim.data.sensordata[:, acc], sensordata[:, acc])
+    assert torch.equal(sim.data.sensordata[:, 3:6], sim.data.site_xpos[:, 0])
+    sim.forward(torch.tensor([1]))
+    assert not torch.equal(sim.data.qacc[1], qacc[1])
+    assert torch.equal(sim.data.qacc[[0, 2]], qacc[[0, 2]])
+
+
+# Sleep.
+
+
+BOX = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="5 5 .1"/>
+    <body name="box" pos="0 0 .12"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_a_model_with_sleep_steps_as_plain_mujoco_does() -> None:
+    sim = build(scene=BOX, enableflags=("sleep",))
+    _ = sim.data.qpos, sim.data.qvel, sim.data.xpos
+    host = mujoco.MjData(sim.mj_model)
+    for _ in range(20):
+        sim.step(50)
+        mujoco.mj_step(sim.mj_model, host, 50)
+    assert not host.tree_awake.any(), "the box has to fall asleep"
+    assert np.array_equal(sim.copy_to_host(1).qpos, host.qpos)
+    # The push wakes up one of them.
+    asleep = sim.data.qpos.clone()
+    sim.data.qvel[1, 2] = host.qvel[2] = 1.0
+    sim.step(20)
+    mujoco.mj_step(sim.mj_model, host, 20)
+    assert np.array_equal(sim.copy_to_host(1).qpos, host.qpos)
+    assert torch.equal(sim.data.qpos[[0, 2]], asleep[[0, 2]])
+
+
+# Exact resume.
+
+
+def test_a_run_with_its_own_constants_continues_bit_for_bit() -> None:
+    fields = ("body_mass", "body_ipos", "geom_pos", "geom_margin")
+
+    def randomized() -> Simulation:
+        sim = build()
+        sim.expand_model_fields(fields)
+        _ = sim.data.sensordata, sim.data.qacc, sim.data.xpos
+        return sim
+
+    sim = randomized()
+    sim.model.body_mass[1] *= 1.3
+    sim.model.body_ipos[2, 1, 2] += 0.05
+    sim.recompute_constants(3)
+    sim.model.geom_pos[0, 2, 2] -= 0.2
+    sim.model.geom_margin[1] += 0.02
+    sim.step(40)
+    sim.forward(stage="vel")
+    saved = sim.state_dict()
+    other = build()
+    other.load_state_dict(saved)
+    for name in (*fields, "body_invweight0", "dof_invweight0", "body_subtreemass"):
+        assert torch.equal(getattr(sim.model, name), getattr(other.model, name)), name
+    for _ in range(3):
+        for name in ("qpos", "qvel", "qacc", "sensordata", "xpos"):
+            assert torch.equal(getattr(sim.data, name), getattr(other.data, name)), name
+        for one in (sim, other):
+            one.step(20)
+            one.forward(stage="vel")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"library": None}, r"before mujoco.batch .* weights"),
+        ({"engine": "warp"}, r"warp engine; this one is native"),
+        ({"state": torch.zeros(2, 5)}, r"expected \(3, \d+\) .*got \(2, 5\)"),
+    ],
+)
+def test_a_state_of_another_engine_or_size_is_refused_and_changes_nothing(change, message) -> None:
+    sim = build()
+    sim.step(5)
+    before = sim.data.qpos.clone()
+    with pytest.raises(ValueError, match=message):
+        sim.load_state_dict({**build().state_dict(), **change})
+    assert torch.equal(sim.data.qpos, before)
