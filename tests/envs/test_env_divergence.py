@@ -197,7 +197,9 @@ def test_controls_that_are_not_finite_are_contained(walkers, value):
         env.sim.data.ctrl[BROKEN] = ctrl
         env.sim.step(8, ("sensordata",))
         env.sim.forward()
-        states.append(torch.cat((env.sim.data.qpos, env.sim.data.qvel, env.sim.data.cvel.flatten(1)), 1))
+        states.append(
+            torch.cat((env.sim.data.qpos, env.sim.data.qvel, env.sim.data.cvel.flatten(1)), 1)
+        )
     assert torch.equal(states[0][OTHERS], states[1][OTHERS])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -10,7 +11,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mjlab.sensor import ContactSensor
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.sensor import ContactSensor, ContactSensorCfg
+from mjlab.tasks.registry import load_env_cfg
 from mjlab.utils.state import capture_state, restore_state
 
 from .contact_scenes import BOX, TERRAIN, build, compose, geom, sense
@@ -223,3 +226,75 @@ def test_a_substep_is_recorded_once_whatever_is_read_in_between():
         scene["touch"].data.current_contact_time + scene["touch"].data.current_air_time,
         torch.full((2, 2), 3 * 0.004),
     )
+
+
+# All substeps in one call.
+
+
+class CountingSensor(ContactSensor):
+    """Overrides `update`, so it is called at every substep."""
+
+    updates = 0
+
+    def update(self, dt: float) -> None:
+        super().update(dt)
+        self.updates += 1
+
+
+def walking_env(edit=lambda cfg: None) -> ManagerBasedRlEnv:
+    cfg = load_env_cfg("Mjlab-Velocity-Flat-Unitree-Go1")
+    cfg.scene.num_envs, cfg.seed = 4, 2
+    feet = next(sensor for sensor in cfg.scene.sensors if getattr(sensor, "track_air_time", False))
+    feet.history_length, feet.fields = 6, ("found", "force", "dist")
+    edit(cfg)
+    return ManagerBasedRlEnv(cfg, device="cpu")
+
+
+def walk(env: ManagerBasedRlEnv, steps: int = 12) -> list[torch.Tensor]:
+    """Return all that contact sensors, rewards and metrics report of some steps."""
+    env.reset(seed=2)
+    generator = torch.Generator().manual_seed(0)
+    record = []
+    for k in range(steps):
+        if k == steps // 2:
+            env.reset(env_ids=torch.tensor([1]))
+        size = (env.num_envs, env.action_manager.total_action_dim)
+        env.step(torch.randn(size, generator=generator))
+        for sensor in env.scene.sensors.values():
+            if isinstance(sensor, ContactSensor):
+                values = dataclasses.asdict(sensor.data).values()
+                record += [value.clone() for value in values if value is not None]
+        record += [
+            env.reward_buf.clone(),
+            env.sim.data.qpos.clone(),
+            env.metrics_manager._sum.clone(),
+        ]
+    return record
+
+
+def test_recorded_substeps_give_the_bits_of_single_steps() -> None:
+    together, one_by_one = walking_env(), walking_env()
+    assert together._steps_as_one
+    one_by_one._steps_as_one = False
+    found, expected = walk(together), walk(one_by_one)
+    assert any((values > 0).any() for values in found)
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+
+
+def delay_the_actuators(cfg) -> None:
+    for actuator in cfg.scene.entities["robot"].articulation.actuators:
+        actuator.delay_max_lag = 2
+
+
+def test_an_actuator_with_a_delay_keeps_single_steps() -> None:
+    assert not walking_env(delay_the_actuators)._steps_as_one
+
+
+def test_a_subclass_that_overrides_update_is_called_at_every_substep(monkeypatch) -> None:
+    monkeypatch.setattr(ContactSensorCfg, "build", lambda cfg: CountingSensor(cfg))
+    env = walking_env()
+    assert not env._steps_as_one
+    env.reset()
+    env.step(torch.zeros(4, env.action_manager.total_action_dim))
+    sensor = next(s for s in env.scene.sensors.values() if isinstance(s, CountingSensor))
+    assert sensor.updates == env.cfg.decimation

@@ -254,8 +254,8 @@ def test_a_run_with_its_own_constants_continues_bit_for_bit() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"library": None}, r"before mujoco.batch .* weights"),
-        ({"engine": "warp"}, r"warp engine; this one is native"),
+        ({"library": None}, r"before mujoco.batch, .* weights"),
+        ({"engine": "warp"}, r"warp engine; this one is native. Use --engine warp"),
         ({"state": torch.zeros(2, 5)}, r"expected \(3, \d+\) .*got \(2, 5\)"),
     ],
 )

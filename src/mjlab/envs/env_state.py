@@ -68,11 +68,7 @@ def _check_fits(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
             f"The saved environment state is of {state['num_envs']} environments; this run has "
             f"{env.num_envs}. Resume with --num-envs {state['num_envs']} to continue exactly."
         )
-    if state["sim"]["engine"] != env.sim.engine_name:
-        raise ValueError(
-            f"The saved environment state is of the {state['sim']['engine']} engine; this run has "
-            f"{env.sim.engine_name}. Resume with --engine {state['sim']['engine']}."
-        )
+    env.sim.check_state(state["sim"])
     _check_terrain(env, state.get("terrain"))
     current = state_dict(env)
     differences = [

@@ -227,8 +227,7 @@ class Scene:
         Sensors with `recorded_fields` need not.
         """
         return any(entity.needs_substep for entity in self._entities.values()) or any(
-            sensor.needs_substep and not sensor.recorded_fields
-            for sensor in self._sensors.values()
+            sensor.needs_substep and not sensor.recorded_fields for sensor in self._sensors.values()
         )
 
     @property

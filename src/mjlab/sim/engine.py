@@ -344,15 +344,15 @@ class Engine(ABC):
     def state_dict(self) -> dict[str, Any]:
         """Return everything an exact resume needs, as tensors and plain values on the CPU."""
 
+    def check_state(self, state: dict[str, Any]) -> None:  # noqa: B027 - accepts all by default.
+        """Raise ValueError if `state` is of another release of the engine, or of another size."""
+
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned.
 
         Positions, velocities and their sensors are current afterwards, quantities of the
-        acceleration stage as they were saved.
-
-        Raises:
-            ValueError: the state is of another version of the engine, or of another size.
+        acceleration stage as they were saved. `check_state` accepts `state`.
         """
 
     def close(self) -> None:  # noqa: B027 - optional hook: most engines hold nothing to free.

@@ -508,13 +508,18 @@ class Simulation:
         """Return the physics state of all environments and their own model fields."""
         return {"engine": self.engine_name, **self._engine.state_dict()}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore `state_dict`; raises ValueError if it comes from another engine or size."""
+    def check_state(self, state: dict[str, Any]) -> None:
+        """Raise ValueError if `state` is of another engine, another release of it or another size."""
         if state["engine"] != self.engine_name:
             raise ValueError(
-                f"The saved simulation state is of the {state['engine']} engine; this one is "
-                f"{self.engine_name}."
+                f"The saved physics state is of the {state['engine']} engine; this one is "
+                f"{self.engine_name}. Use --engine {state['engine']}."
             )
+        self._engine.check_state(state)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore `state_dict`; raises ValueError, and changes nothing, as `check_state` does."""
+        self.check_state(state)
         self.expand_model_fields(tuple(state["model"]))
         self._engine.load_state_dict(state)
         for callback in self._forward_callbacks:

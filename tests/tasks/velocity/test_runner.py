@@ -126,3 +126,34 @@ def test_an_export_that_fails_costs_no_checkpoint(make_runner, tmp_path, monkeyp
     runner.save(str(tmp_path / "model_0.pt"))
     assert (tmp_path / "model_0.pt").is_file()
     assert "no such operator" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda sim: sim.pop("library"), "native engine before mujoco.batch"),
+        (lambda sim: sim.update(engine="warp"), "warp engine; this one is native"),
+    ],
+)
+def test_a_checkpoint_of_another_engine_gives_weights_but_not_episodes(
+    make_runner, tmp_path, caplog, change, words
+):
+    first = make_runner(tmp_path / "first")
+    first.learn(2)
+    path = tmp_path / "first" / "model_1.pt"
+    checkpoint = torch.load(path, weights_only=True)
+    change(checkpoint["training_state"]["env"]["sim"])
+    torch.save(checkpoint, path)
+    resumed = make_runner(tmp_path / "resumed")
+    resumed.load(str(path))
+    assert torch.equal(weights(resumed), weights(first))
+    before = resumed.env.unwrapped.sim.data.qpos.clone()
+    with pytest.raises(ValueError, match=words):
+        resumed.env.unwrapped.load_state_dict(checkpoint["training_state"]["env"])
+    assert torch.equal(resumed.env.unwrapped.sim.data.qpos, before)
+    resumed.learn(3)
+    assert resumed.current_learning_iteration == 3
+    (warning,) = [record.getMessage() for record in caplog.records if words in record.getMessage()]
+    assert "episodes and random numbers start anew" in warning
+    policy_only = make_runner(None)
+    policy_only.load(str(path), load_cfg={"actor": True})

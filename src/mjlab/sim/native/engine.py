@@ -474,17 +474,19 @@ class NativeEngine(Engine):
             },
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def check_state(self, state: dict[str, Any]) -> None:
         if state.get("library") != "mujoco.batch":
             raise ValueError(
-                "The saved simulation is of the native engine before mujoco.batch and cannot be "
-                "continued exactly; start a new run from its weights."
+                "The saved physics state is of the native engine before mujoco.batch, which cannot "
+                "be continued exactly; only weights can be used."
             )
         if state["state"].shape != self._rows.shape:
             raise ValueError(
-                f"The saved simulation: expected {tuple(self._rows.shape)} state values, got "
+                f"The saved physics state: expected {tuple(self._rows.shape)} values, got "
                 f"{tuple(state['state'].shape)}; use the task and --num-envs that it was saved with."
             )
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         self._before = None
         for name in state["bound"]:
             self.data_field(name)
@@ -515,7 +517,9 @@ class _Copy:
             self.source = source
             self.values = source.to(dtype, copy=True, memory_format=torch.contiguous_format)
 
-    def copy_out(self, rows: torch.Tensor | None = None, columns: torch.Tensor | None = None) -> None:
+    def copy_out(
+        self, rows: torch.Tensor | None = None, columns: torch.Tensor | None = None
+    ) -> None:
         """Copy the source out: all of it, or `rows`, or `columns` ((size,) bool) of a matrix."""
         if rows is None and columns is None:
             self.values.copy_(self.source)
@@ -551,7 +555,9 @@ class _Input(_Copy):
         self._seen.copy_(self.values)
         return written
 
-    def copy_out(self, rows: torch.Tensor | None = None, columns: torch.Tensor | None = None) -> None:
+    def copy_out(
+        self, rows: torch.Tensor | None = None, columns: torch.Tensor | None = None
+    ) -> None:
         super().copy_out(rows, columns)
         index = slice(None) if rows is None else rows
         self._seen[index] = self.values[index]
