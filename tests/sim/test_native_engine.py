@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 
 import mujoco
@@ -10,8 +11,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mujoco.batch import DATA_FIELDS
 
 from mjlab.sim import MujocoCfg, Simulation, SimulationCfg
+from mjlab.sim.engine import ACCELERATION_FIELDS, INPUTS, VELOCITY_FIELDS
+
+from .parity_models import MODELS
 
 NUM_ENVS = 3
 SCENE = """
@@ -185,6 +190,30 @@ def test_an_earlier_stage_leaves_quantities_of_the_acceleration_stage() -> None:
     sim.forward(torch.tensor([1]))
     assert not torch.equal(sim.data.qacc[1], qacc[1])
     assert torch.equal(sim.data.qacc[[0, 2]], qacc[[0, 2]])
+
+
+@pytest.mark.parametrize("stage", ["pos", "vel"])
+@pytest.mark.parametrize("name", ["landing_box", "tendons", "hinge_chain"])
+def test_a_stage_computes_its_fields_and_leaves_those_of_later_ones(name: str, stage: str) -> None:
+    """One `MjData` serves all environments: nothing of another one may be seen."""
+    sim = build(scene=MODELS[name])
+    generator = torch.Generator().manual_seed(0)
+    for field in (sim.data.qpos, sim.data.qvel):
+        field += 0.1 * torch.randn(field.shape, generator=generator)
+    bound = {}
+    for field in sorted(DATA_FIELDS - {*INPUTS, "history", "plugin_state"}):
+        with contextlib.suppress(AttributeError):
+            bound[field] = getattr(sim.data, field)
+    sim.step(5)
+    old = {field: values.clone() for field, values in bound.items()}
+    sim.forward(stage=stage)
+    staged = {field: values.clone() for field, values in bound.items()}
+    sim.forward()
+    later = ACCELERATION_FIELDS | (VELOCITY_FIELDS if stage == "pos" else frozenset())
+    for field, values in bound.items():
+        if field != "sensordata":
+            expected = old[field] if field in later else values
+            assert torch.equal(staged[field], expected), field
 
 
 # Sleep.

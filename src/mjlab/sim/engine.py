@@ -35,7 +35,13 @@ INPUTS = (*ZERO_INPUTS, "qpos", "eq_active", "mocap_pos", "mocap_quat")
 # Results that MuJoCo's reset clears too.
 RESULTS_ZERO_ON_RESET = frozenset({"qacc", "act_dot", "sensordata"})
 
-# Derived fields that a forward pass computes in its last stage, beside columns of `sensordata`.
+# Derived fields that a forward pass computes in its second and in its last stage, beside columns of
+# `sensordata`.
+VELOCITY_FIELDS = frozenset(
+    {"cvel", "cdof_dot", "actuator_velocity", "ten_velocity", "flexedge_velocity", "energy"}
+    | {"qfrc_bias", "qfrc_passive", "qfrc_spring", "qfrc_damper", "qfrc_gravcomp", "qfrc_fluid"}
+    | {"qfrc_adhesion", "subtree_linvel", "subtree_angmom"}
+)
 ACCELERATION_FIELDS = frozenset(
     {"qacc", "qacc_smooth", "qfrc_smooth", "qfrc_constraint", "qfrc_actuator", "qfrc_inverse"}
     | {"actuator_force", "act_dot", "cacc", "cfrc_int", "cfrc_ext"}

@@ -21,28 +21,26 @@ import torch
 from mujoco.batch import DATA_FIELDS, MODEL_FIELDS, Batch, SimulationError
 
 from mjlab.sim.engine import (
+    ACCELERATION_FIELDS,
+    COLLISION_MASKS,
+    INPUTS,
+    RESULTS_ZERO_ON_RESET,
     ROTATION_MATRICES,
+    VELOCITY_FIELDS,
     Capabilities,
     Engine,
     EngineUnavailableError,
     Stage,
-)
-from mjlab.sim.field_lists import (
-    ACCELERATION_FIELDS,
-    COLLISION_MASKS,
-    CONSTANTS_AT_QPOS0,
-    FIXED_CONSTANTS,
-    INPUTS,
-    RESULTS_ZERO_ON_RESET,
+    check_sensor_fed,
 )
 from mjlab.sim.native.rays import NativeRays
 from mjlab.sim.native.render import NativeRenderer, render_problem
-from mjlab.sim.sensor_fed import refuse_without_sensor
+from mjlab.sim.randomization import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
 from mjlab.utils.processes import cores_per_process
 
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
-    from mjlab.sim.rendering import CameraView, Images
+    from mjlab.sim.engine import CameraView, Images
 
 logger = logging.getLogger(__name__)
 
@@ -86,6 +84,13 @@ _STAGES = {
     "acc": int(mujoco.mjtStage.mjSTAGE_ACC),
 }
 
+# Outputs that a stage does not compute.
+_LATER_FIELDS = {
+    "pos": VELOCITY_FIELDS | ACCELERATION_FIELDS,
+    "vel": ACCELERATION_FIELDS,
+    "acc": frozenset[str](),
+}
+
 # Steps for which the state before the last substep is kept; see `NativeEngine._fill`.
 _FIRST_STEPS = 100
 
@@ -123,7 +128,8 @@ class NativeEngine(Engine):
         # (nsensordata,) columns of `sensordata` that a stage computes.
         stages = np.repeat(self._model.sensor_needstage, self._model.sensor_dim)
         self._sensor_columns = {
-            name: torch.from_numpy(stages <= value) for name, value in _STAGES.items()
+            name: None if (stages <= value).all() else torch.from_numpy(stages <= value)
+            for name, value in _STAGES.items()
         }
         self._frame_marks: dict[str, np.ndarray] = {}
         self._bounds: Batch | None = None
@@ -150,7 +156,7 @@ class NativeEngine(Engine):
         if name not in self._tensors:
             if name not in DATA_FIELDS:
                 raise AttributeError(f"The native engine: {_reason(self._batch.bind, name)}.")
-            refuse_without_sensor(self._model, name)
+            check_sensor_fed(self._model, name)
             source = _as_tensor(self._batch.bind(name))
             dtype = torch.bool if name == "eq_active" else _seam_type(source)
             if name in INPUTS:
@@ -247,11 +253,14 @@ class NativeEngine(Engine):
         recorded = {name: field.new_empty(nstep, *field.shape) for name, field in fields.items()}
         if nstep == 0:
             return recorded
-        # Not `Batch.rollout`: it stops environments that warn, and single steps are as fast.
-        calls = [1] * nstep if record else [nstep]
-        if self._first_steps:
-            self._first_steps -= 1
-            calls = [1] * nstep if record else [nstep - 1, 1][nstep == 1 :]
+        if record:
+            # Not `Batch.rollout`: it stops environments that warn, and single steps are as fast.
+            calls = [1] * nstep
+        elif self._first_steps and nstep > 1:
+            calls = [nstep - 1, 1]
+        else:
+            calls = [nstep]
+        self._first_steps = max(self._first_steps - 1, 0)
         self._copy_in()
         for k, count in enumerate(calls):
             is_last = k == len(calls) - 1
@@ -278,11 +287,9 @@ class NativeEngine(Engine):
         if stage == "acc" and "qacc_warmstart" in self._inputs:
             self._inputs["qacc_warmstart"].copy_out(env_ids)
         # An `MjData` serves many environments: what a stage does not compute is another's.
-        for name, field in self._outputs.items():
-            if stage == "acc" or name not in (*ACCELERATION_FIELDS, "sensordata"):
-                field.copy_out(rows)
-            elif name == "sensordata":
-                field.copy_out(rows, self._sensor_columns[stage])
+        for name in self._outputs.keys() - _LATER_FIELDS[stage]:
+            columns = self._sensor_columns[stage] if name == "sensordata" else None
+            self._outputs[name].copy_out(rows, columns)
 
     def reset(self, env_ids: torch.Tensor | None) -> None:
         self._copy_in_model()
