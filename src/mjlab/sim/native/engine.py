@@ -421,7 +421,7 @@ class NativeEngine(Engine):
     ) -> Batch:
         """Return `count` simulations of a model."""
         # Sleep needs an `MjData` for each. Elsewhere that costs memory (0.23 MB a Go1) and saves
-        # nothing: 0.97 to 1.08 of the time of Go1 and G1, with 256 to 4,096 environments.
+        # nothing: 0.97 to 1.09 of the time of Go1 and G1, with 256 to 4,096 environments.
         sleeps = model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         return Batch(model, count, num_threads or self._batch.nthread, persistent=bool(sleeps))
 
