@@ -171,12 +171,15 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
         shape = (len(rows), self.force_limit.shape[1])
         limit = _per_target(effort_limit, shape, "effort_limit")
         self.force_limit[rows] = limit
-        for field in ("actuator_forcerange", "actuator_ctrlrange"):
+        for field, columns in (
+            ("actuator_forcerange", self.global_element_ids),
+            ("actuator_ctrlrange", self.global_ctrl_ids),
+        ):
             values = getattr(self._model, field)
             # One row that stands for all environments cannot hold a limit of one of them.
             if not isinstance(values, SharedField):
                 ranges = torch.stack((-limit, limit), dim=-1).to(values.dtype)
-                values[rows[:, None], self.global_ctrl_ids] = ranges
+                values[rows[:, None], columns] = ranges
 
 
 def _rows_of(parameter: torch.Tensor) -> tuple[int, torch.device]:

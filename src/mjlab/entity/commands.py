@@ -146,7 +146,7 @@ class EntityCommands:
     def write_ctrl_to_sim(
         self, ctrl: torch.Tensor, ctrl_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Write controls (k, number of actuators)."""
+        """Write controls (k, number of controls)."""
         self.data.write_ctrl(ctrl, ctrl_ids, env_ids)
 
     def write_mocap_pose_to_sim(self, mocap_pose: torch.Tensor, env_ids: EnvIds = None) -> None:

@@ -189,7 +189,10 @@ class StateWriter:
                 assign(wrench[..., half], value, env_ids, columns)
 
     def write_ctrl(self, ctrl: torch.Tensor, ctrl_ids: Ids = None, env_ids: EnvIds = None) -> None:
-        """Write controls, (k, number of actuators); `ctrl_ids` count within the entity.
+        """Write controls, (k, number of controls); `ctrl_ids` count within the entity.
+
+        Every actuator of the entity has its controls in turn: most have one, `<pid>`, `<dcmotor>`
+        and `<orientation>` may have several.
 
         Raises:
             ValueError: the entity has no configured actuators, or the width is wrong.
