@@ -242,7 +242,10 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         element_ids = [actuator.id for actuator in elements]
         by_element = [control_columns(mj_model, (i,)) for i in element_ids]
         columns = [
-            ctrl[k] for k in range(max(map(len, by_element))) for ctrl in by_element if k < len(ctrl)
+            ctrl[k]
+            for k in range(max(map(len, by_element)))
+            for ctrl in by_element
+            if k < len(ctrl)
         ]
         self._target_ids = _int_tensor(self._target_ids_list, device)
         self._global_element_ids = _int_tensor(element_ids, device)

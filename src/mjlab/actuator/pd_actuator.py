@@ -124,8 +124,12 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
             ("damping", self.cfg.damping),
             ("force_limit", self.cfg.effort_limit),
         ):
-            setattr(self, name, torch.full(shape, float(value), device=device))
-            setattr(self, f"default_{name}", torch.full(shape, float(value), device=device))
+            setattr(self, name, torch.full(shape, float(value), dtype=torch.float32, device=device))
+            setattr(
+                self,
+                f"default_{name}",
+                torch.full(shape, float(value), dtype=torch.float32, device=device),
+            )
 
     def compute(self, cmd: ActuatorCmd) -> torch.Tensor:
         """Return the forces, (N, n), by the class's control law."""

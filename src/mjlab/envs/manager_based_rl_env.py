@@ -370,7 +370,7 @@ class ManagerBasedRlEnv:
         """Return the time that passed for commands: none where an episode has just begun."""
         if len(reset_ids) == 0:
             return self.step_dt
-        dt = torch.full((self.num_envs,), self.step_dt, device=self.device)
+        dt = torch.full((self.num_envs,), self.step_dt, dtype=torch.float32, device=self.device)
         dt[reset_ids] = 0.0
         return dt
 

@@ -94,7 +94,7 @@ class Scene:
             scene_cfg.spec_fn(self._spec)
             self.entity_options = drop_overridden(self._spec.option, self.entity_options)
         add_key(self._spec, [entity.initial_state for entity in self._entities.values()])
-        self._env_origins = torch.zeros(scene_cfg.num_envs, 3, device=device)
+        self._env_origins = torch.zeros(scene_cfg.num_envs, 3, dtype=torch.float32, device=device)
 
     # Composition.
 

@@ -315,7 +315,7 @@ def _reads(actuator: Actuator, command: CommandField, builtin: type[Actuator]) -
 def _refusal(function: str, actuator: Actuator, supported: str) -> str:
     kind = type(actuator).__name__
     if isinstance(actuator, XmlActuator):
-        kind += f" with command fields {', '.join(actuator.command_fields)!r}"
+        kind += f" with command field {', '.join(actuator.command_fields)!r}"
     return (
         f"{function}: the actuators {list(actuator.target_names)} are of kind {kind}, which it "
         f"cannot randomize. Supported: {supported}. Select others by name."
