@@ -76,7 +76,7 @@ class EntityCfg:
 
     init_state: InitialStateCfg = field(default_factory=InitialStateCfg)
     """The initial state."""
-    spec_fn: Callable[[], mujoco.MjSpec] = field(default_factory=lambda: lambda: mujoco.MjSpec())
+    spec_fn: Callable[[], mujoco.MjSpec] = field(default_factory=lambda: mujoco.MjSpec)
     """Returns the MuJoCo spec of the entity, which is copied."""
     articulation: EntityArticulationInfoCfg | None = None
     """Actuators and soft joint limits."""
