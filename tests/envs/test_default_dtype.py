@@ -43,7 +43,9 @@ def rollout(task: str, engine: Any, dtype: torch.dtype) -> list[torch.Tensor]:
         env = ManagerBasedRlEnv(cfg, device="cpu")
         observations, _ = env.reset()
         results = list(observations.values())
-        actions = np.random.default_rng(0).uniform(-1, 1, (5, NUM_ENVS, *env.action_space.shape[1:]))
+        actions = np.random.default_rng(0).uniform(
+            -1, 1, (5, NUM_ENVS, *env.action_space.shape[1:])
+        )
         for step, action in enumerate(actions):
             if step == 2:
                 env.episode_length_buf[1] = env.max_episode_length
