@@ -476,3 +476,27 @@ def test_building_twice_from_one_config_gives_independent_entities(kit):
     first, second = cfg.build(), cfg.build()
     first.spec.body("thigh").add_site(name="mark")
     assert "mark" not in second.site_names
+
+
+@pytest.mark.parametrize("xml", ["ROBOT", "ARM"])
+def test_a_spec_fn_may_return_one_spec_for_two_entities_and_two_scenes(kit, xml):
+    spec = mujoco.MjSpec.from_string(getattr(kit, xml))
+    spec.option.density = 3.0
+    spec.add_key(name="home", qpos=[0.1] * spec.compile().nq)
+    written = spec.to_xml()
+    cfg = EntityCfg(
+        spec_fn=lambda: spec,
+        cameras=(CameraCfg(name="eye", body=spec.bodies[-1].name),),
+        articulation=actuated(
+            BuiltinMotorActuatorCfg(target_names_expr=(spec.joints[-1].name,), effort_limit=5.0)
+        ),
+    )
+    once = cfg.build().compile()
+    for _ in range(2):
+        _, scene = kit.make(2, one=cfg, two=cfg)
+        model = scene.compile()
+        assert (model.nq, model.nu, model.ncam) == (2 * once.nq, 2, 2)
+        assert scene["two"].joint_names == scene["one"].joint_names
+        assert model.opt.density == 3.0
+    # The user's own spec stays as it was.
+    assert spec.to_xml() == written

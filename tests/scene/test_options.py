@@ -1,4 +1,4 @@
-"""Simulation options in the XML of entities: applied, unless somebody contradicts them."""
+"""Simulation options in the XML of entities: decided by `MujocoCfg`, or applied to the scene."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import warnings
 import mujoco
 import pytest
 
+from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.scene import Scene, SceneCfg
 from mjlab.sim import MujocoCfg, Simulation, SimulationCfg
 
@@ -22,40 +23,70 @@ def xml(kit, request):
     return getattr(kit, request.param)
 
 
-def test_an_option_nobody_contradicts_is_applied_and_logged(kit, xml, caplog):
-    with warnings.catch_warnings(), caplog.at_level(logging.INFO):
-        warnings.simplefilter("error")
-        scene = build(robot=kit.cfg(xml, 'timestep=".01" gravity="0 0 -1" cone="elliptic"/>'))
-        cfg = MujocoCfg()
-        resolved = scene.resolve_mujoco_cfg(cfg)
-    assert (resolved.timestep, resolved.gravity, resolved.cone) == (0.01, (0, 0, -1), "elliptic")
-    assert resolved.solver == "newton"
-    assert cfg == MujocoCfg(), "the user's config was changed"
-    assert "MujocoCfg.timestep = 0.01, as the XML of robot asks." in caplog.text
+def reports(scene: Scene, cfg: MujocoCfg, caplog) -> list[str]:
+    caplog.clear()
+    with caplog.at_level(logging.WARNING):
+        scene.report_overruled_options(cfg)
+    return [record.getMessage() for record in caplog.records]
 
 
-def test_a_contradicting_config_wins_and_is_reported(kit, xml):
-    scene = build(robot=kit.cfg(xml, 'timestep=".01" cone="elliptic"/>'))
-    with pytest.warns(UserWarning, match=r"timestep: 0.005, not 0.01 as robot") as caught:
-        resolved = scene.resolve_mujoco_cfg(MujocoCfg(timestep=0.005))
-    assert resolved.timestep == 0.005
-    assert resolved.cone == "elliptic"
-    assert "cone" not in str(caught[0].message)
+def options_of(model: mujoco.MjModel) -> dict:
+    names = [name for name in dir(model.opt) if not name.startswith("_")]
+    return {name: str(getattr(model.opt, name)) for name in names}
 
 
-def test_a_config_that_agrees_is_not_reported(kit, xml):
-    scene = build(robot=kit.cfg(xml, 'timestep=".005"/>'))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert scene.resolve_mujoco_cfg(MujocoCfg(timestep=0.005)).timestep == 0.005
+def test_the_config_decides_and_each_difference_is_reported_with_the_assignment(kit, xml, caplog):
+    scene = build(robot=kit.cfg(xml, 'timestep=".01" cone="elliptic" gravity="0 0 -1"/>'))
+    assert reports(scene, MujocoCfg(cone="elliptic"), caplog) == [
+        "Option timestep is 0.002, from MujocoCfg; to follow the XML of 'robot', "
+        "set sim.mujoco.timestep = 0.01",
+        "Option gravity is (0.0, 0.0, -9.81), from MujocoCfg; to follow the XML of 'robot', "
+        "set sim.mujoco.gravity = (0.0, 0.0, -1.0)",
+    ]
+    sim = Simulation(1, SimulationCfg(), spec=scene.spec, device="cpu")
+    assert sim.mj_model.opt.timestep == 0.002
+    assert sim.mj_model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
 
 
-def test_an_option_written_out_counts_even_at_mujocos_default(kit):
+def test_the_assignment_that_is_reported_silences_the_report(kit, xml, caplog):
+    scene = build(robot=kit.cfg(xml, 'timestep=".01" integrator="RK4" impratio="7"/>'))
+    sim = SimulationCfg()
+    for line in reports(scene, sim.mujoco, caplog):
+        exec(line.partition(", set ")[2], {"sim": sim})
+    assert (sim.mujoco.timestep, sim.mujoco.integrator, sim.mujoco.impratio) == (0.01, "rk4", 7)
+    assert reports(scene, sim.mujoco, caplog) == []
+
+
+def test_an_option_written_out_counts_even_at_mujocos_default(kit, caplog):
     """MujocoCfg defaults to implicitfast; an XML that says Euler means it."""
-    quiet = build(robot=kit.cfg(kit.CART))
-    assert quiet.resolve_mujoco_cfg(MujocoCfg()).integrator == "implicitfast"
+    assert reports(build(robot=kit.cfg(kit.CART)), MujocoCfg(), caplog) == []
     spoken = build(robot=kit.cfg(kit.CART, 'integrator="Euler"/>'))
-    assert spoken.resolve_mujoco_cfg(MujocoCfg()).integrator == "euler"
+    assert "sim.mujoco.integrator = 'euler'" in reports(spoken, MujocoCfg(), caplog)[0]
+
+
+def test_a_simulation_of_the_spec_and_the_environment_have_the_same_options(kit, caplog):
+    options = (
+        'timestep=".01" integrator="Euler" density="7" noslip_iterations="3"'
+        '><flag contact="disable"/></option>'
+    )
+    entity = kit.cfg(kit.CART, options)
+    cfg = SimulationCfg(engine="native", mujoco=MujocoCfg(disableflags=("limit",)))
+    alone = Simulation(1, cfg, spec=entity.spec_fn(), device="cpu")
+    scene_cfg = SceneCfg(num_envs=1, entities={"robot": entity})
+    with caplog.at_level(logging.WARNING):
+        env = ManagerBasedRlEnv(
+            ManagerBasedRlEnvCfg(
+                decimation=1, scene=scene_cfg, sim=cfg, observations={}, actions={}
+            ),
+            device="cpu",
+        )
+    assert "set sim.mujoco.timestep = 0.01" in caplog.text
+    composed = Simulation(1, cfg, spec=build(robot=entity).spec, device="cpu")
+    assert options_of(env.sim.mj_model) == options_of(composed.mj_model)
+    assert options_of(env.sim.mj_model) == options_of(alone.mj_model)
+    assert env.sim.mj_model.opt.density == 7.0
+    assert env.physics_dt == 0.002
+    env.close()
 
 
 @pytest.mark.parametrize(
@@ -94,39 +125,44 @@ def test_options_set_in_code_are_recognized(kit):
     assert cfg.build().options.values == {"timestep": 0.01, "wind": (1.0, 0.0, 0.0)}
 
 
-def test_options_that_the_config_lacks_reach_the_compiled_model(kit, xml):
+def test_options_that_the_config_lacks_reach_the_compiled_model(kit, xml, caplog):
     scene = build(robot=kit.cfg(xml, 'density="1000" wind="1 2 3" noslip_iterations="4"/>'))
-    cfg = scene.resolve_mujoco_cfg(MujocoCfg())
-    sim = Simulation(1, SimulationCfg(mujoco=cfg), spec=scene.spec, device="cpu")
+    assert reports(scene, MujocoCfg(), caplog) == []
+    sim = Simulation(1, SimulationCfg(), spec=scene.spec, device="cpu")
     assert sim.mj_model.opt.density == 1000.0
     assert sim.mj_model.opt.wind.tolist() == [1.0, 2.0, 3.0]
     assert sim.mj_model.opt.noslip_iterations == 4
 
 
-def test_flags_add_up_with_those_of_the_config(kit, xml):
+def test_flags_add_up_with_those_of_the_config(kit, xml, caplog):
     scene = build(
         robot=kit.cfg(xml, '><flag contact="disable" energy="enable"/></option>'),
-        other=kit.cfg(kit.BOX, '><flag limit="disable"/></option>'),
+        other=kit.cfg(kit.BOX, '><flag limit="disable" gravity="enable"/></option>'),
     )
-    cfg = scene.resolve_mujoco_cfg(MujocoCfg(disableflags=("gravity",)))
+    cfg = MujocoCfg(disableflags=("gravity",))
+    assert reports(scene, cfg, caplog) == [
+        "Option disableflags is ('gravity',), from MujocoCfg; to follow the XML of 'other', "
+        "set sim.mujoco.disableflags = ()"
+    ]
     sim = Simulation(1, SimulationCfg(mujoco=cfg), spec=scene.spec, device="cpu")
     for flag in ("CONTACT", "LIMIT", "GRAVITY"):
         assert sim.mj_model.opt.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}")
     assert sim.mj_model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY
 
 
-def test_entities_that_disagree_are_reported_and_neither_wins(kit):
+def test_entities_that_disagree_beyond_the_config_are_reported_and_neither_wins(kit):
     with pytest.warns(UserWarning, match="not applied") as caught:
         scene = build(
-            one=kit.cfg(kit.BOX, 'timestep=".01" density="7" cone="elliptic"/>'),
-            two=kit.cfg(kit.CART, 'timestep=".02" density="7" cone="pyramidal"/>'),
+            one=kit.cfg(kit.BOX, 'timestep=".01" density="7" viscosity="1"/>'),
+            two=kit.cfg(kit.CART, 'timestep=".02" density="7" viscosity="2"/>'),
         )
     text = str(caught[0].message)
-    assert "timestep: 0.01 (one), 0.02 (two)" in text
-    assert "cone: elliptic (one), pyramidal (two)" in text
+    assert "viscosity: 1.0 (one), 2.0 (two)" in text
+    # The config decides this one, whatever they say.
+    assert "timestep" not in text
     assert "density" not in text
-    assert scene.resolve_mujoco_cfg(MujocoCfg()) == MujocoCfg()
     assert scene.compile().opt.density == 7.0
+    assert scene.compile().opt.viscosity == 0.0
 
 
 def test_entities_that_disagree_about_a_flag_keep_their_other_flags(kit):
@@ -151,6 +187,15 @@ def test_the_scenes_own_edits_win_and_are_reported(kit):
     assert scene.compile().opt.density == 5.0
     assert scene.compile().opt.viscosity == 1.0
     assert set(scene.entity_options) == {"viscosity"}
+
+
+def test_an_option_of_the_config_that_the_scene_edits_is_reported(kit, caplog):
+    def spec_fn(spec):
+        spec.option.timestep = 0.01
+
+    scene = build(spec_fn, robot=kit.cfg(kit.BOX))
+    (line,) = reports(scene, MujocoCfg(), caplog)
+    assert "to follow SceneCfg.spec_fn, set sim.mujoco.timestep = 0.01" in line
 
 
 def test_the_entitys_own_spec_keeps_working_alone(kit):

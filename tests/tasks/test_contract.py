@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
+import pickle
 import typing
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -110,6 +111,12 @@ def dataclasses_in(value: Any, seen: set[int] | None = None) -> Iterator[Any]:
         inner = []
     for item in inner:
         yield from dataclasses_in(item, seen)
+
+
+@pytest.mark.parametrize("play", [False, True], ids=["train", "play"])
+def test_configs_are_equal_to_their_pickled_copies(task: str, play: bool) -> None:
+    for cfg in (load_env_cfg(task, play=play), load_rl_cfg(task)):
+        assert pickle.loads(pickle.dumps(cfg)) == cfg
 
 
 @pytest.mark.parametrize("play", [False, True], ids=["train", "play"])

@@ -22,6 +22,7 @@ from mjlab.actuator.command import TransmissionType as TransmissionType
 from mjlab.actuator.command import read_command
 from mjlab.utils.buffers import DelayBuffer
 from mjlab.utils.mujoco import CommandField as CommandField
+from mjlab.utils.mujoco import control_columns
 from mjlab.utils.state import stateful
 from mjlab.utils.substep import is_constant_within_step
 
@@ -129,14 +130,14 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
     """Turns commands for its targets into controls of MuJoCo actuators.
 
     To write your own: in `edit_spec` add one element a target and append it to
-    `self._mjs_actuators`, and in `compute` return the controls, (N, number of elements). Keep what
+    `self._mjs_actuators`, and in `compute` return the controls, (N, number of controls). Keep what
     changes at run time in tensor attributes, so that a resumed run finds it again. A `compute` that
     remembers earlier calls also overrides `compute_after_reset`.
     """
 
     _transient = {
         "cfg", "entity", "_mjs_actuators", "_target_ids_list", "_target_names", "_target_ids",
-        "_ctrl_ids", "_global_ctrl_ids", "_in_group", "_resets_delay",
+        "_ctrl_ids", "_global_ctrl_ids", "_global_element_ids", "_in_group", "_resets_delay",
     }  # fmt: skip
 
     def __init__(
@@ -157,6 +158,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         self._target_ids: torch.Tensor | None = None
         self._ctrl_ids: torch.Tensor | None = None
         self._global_ctrl_ids: torch.Tensor | None = None
+        self._global_element_ids: torch.Tensor | None = None
         self._delay_buffer: DelayBuffer | None = None
         self._in_group = False
         self._resets_delay = True
@@ -180,13 +182,21 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
 
     @property
     def ctrl_ids(self) -> torch.Tensor:
-        """(number of elements,) int64 indices within the entity's actuators."""
+        """(number of controls,) int64 indices within the entity's controls."""
         return self._initialized(self._ctrl_ids)
 
     @property
     def global_ctrl_ids(self) -> torch.Tensor:
-        """(number of elements,) int64 columns of `ctrl` in the simulation."""
+        """(number of controls,) int64 columns of `ctrl` in the simulation.
+
+        Most elements have one control. Of those with several, come all first ones, then all second.
+        """
         return self._initialized(self._global_ctrl_ids)
+
+    @property
+    def global_element_ids(self) -> torch.Tensor:
+        """(number of elements,) int64 ids of the elements in the model: rows of `actuator_gainprm`."""
+        return self._initialized(self._global_element_ids)
 
     @property
     def has_delay(self) -> bool:
@@ -228,11 +238,19 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
                 "model is compiled."
             )
         # Actuators without a name can only be found by their place in the spec.
-        local_ids = {actuator.id: k for k, actuator in enumerate(self.entity.spec.actuators)}
-        global_ids = [actuator.id for actuator in elements]
+        own = control_columns(mj_model, (actuator.id for actuator in self.entity.spec.actuators))
+        element_ids = [actuator.id for actuator in elements]
+        by_element = [control_columns(mj_model, (i,)) for i in element_ids]
+        columns = [
+            ctrl[k]
+            for k in range(max(map(len, by_element)))
+            for ctrl in by_element
+            if k < len(ctrl)
+        ]
         self._target_ids = _int_tensor(self._target_ids_list, device)
-        self._global_ctrl_ids = _int_tensor(global_ids, device)
-        self._ctrl_ids = _int_tensor([local_ids[i] for i in global_ids], device)
+        self._global_element_ids = _int_tensor(element_ids, device)
+        self._global_ctrl_ids = _int_tensor(columns, device)
+        self._ctrl_ids = _int_tensor([own.index(column) for column in columns], device)
         self._in_group, self._resets_delay, self._delay_buffer = False, True, None
         if self.has_delay:
             self._delay_buffer = self.make_delay_buffer(data.nworld, device)
@@ -279,7 +297,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
 
     @abstractmethod
     def compute(self, cmd: ActuatorCmd) -> torch.Tensor:
-        """Return the controls of the elements, (N, number of elements)."""
+        """Return the controls of the elements, (N, number of controls)."""
 
     def compute_after_reset(self, cmd: ActuatorCmd, env_ids: torch.Tensor | slice) -> torch.Tensor:
         """As `compute`, but only the rows `env_ids`, which were just reset, are of interest.

@@ -188,7 +188,7 @@ class BuiltinDcMotorActuator(DirectActuator[BuiltinDcMotorActuatorCfg]):
         if self._input() != _INPUT_VELOCITY:
             return command
         # Read at each call, because the gain may be randomized.
-        gainprm = self._model.actuator_gainprm[:, self.global_ctrl_ids]
+        gainprm = self._model.actuator_gainprm[:, self.global_element_ids]
         resistance, constant, damping = gainprm[..., 0], gainprm[..., 1], gainprm[..., 6]
         total = damping * resistance / constant  # s + K
         gain = 1.0 if self.cfg.mode == DcMotorInputMode.VOLTAGE else total - constant

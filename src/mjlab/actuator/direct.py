@@ -45,7 +45,7 @@ class DirectActuator(Actuator[ActuatorCfgT]):
 
     @constant_within_step
     def compute(self, cmd: ActuatorCmd) -> torch.Tensor:
-        """Return the commands that the elements read, (N, number of elements)."""
+        """Return the commands that the elements read, (N, number of controls)."""
         commands = [getattr(cmd, f"{field}_target") for field in self.command_fields]
         return commands[0] if len(commands) == 1 else torch.cat(commands, dim=1)
 

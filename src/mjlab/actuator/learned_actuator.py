@@ -96,7 +96,9 @@ class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
         num_envs, num_targets = self.stiffness.shape
         self._history = CircularBuffer(self.cfg.history_length, num_envs, device)
         # The first frame makes the buffer's memory; after the reset no environment has a history.
-        self._history.append(torch.zeros(num_envs, 2, num_targets, device=device))
+        self._history.append(
+            torch.zeros(num_envs, 2, num_targets, dtype=torch.float32, device=device)
+        )
         self._history.reset()
         self._try_network()
 
@@ -157,7 +159,9 @@ class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
 
     def _try_network(self) -> None:
         num_rows, num_inputs = self.stiffness.numel(), 2 * self.cfg.history_length
-        inputs = torch.zeros(num_rows, num_inputs, device=self.stiffness.device)
+        inputs = torch.zeros(
+            num_rows, num_inputs, dtype=torch.float32, device=self.stiffness.device
+        )
         expected = (
             f"({num_rows}, {num_inputs}) inputs (2 x history_length={self.cfg.history_length}, a "
             f"row a joint) and return ({num_rows}, 1)"

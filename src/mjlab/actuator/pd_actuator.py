@@ -124,8 +124,12 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
             ("damping", self.cfg.damping),
             ("force_limit", self.cfg.effort_limit),
         ):
-            setattr(self, name, torch.full(shape, float(value), device=device))
-            setattr(self, f"default_{name}", torch.full(shape, float(value), device=device))
+            setattr(self, name, torch.full(shape, float(value), dtype=torch.float32, device=device))
+            setattr(
+                self,
+                f"default_{name}",
+                torch.full(shape, float(value), dtype=torch.float32, device=device),
+            )
 
     def compute(self, cmd: ActuatorCmd) -> torch.Tensor:
         """Return the forces, (N, n), by the class's control law."""
@@ -171,12 +175,15 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
         shape = (len(rows), self.force_limit.shape[1])
         limit = _per_target(effort_limit, shape, "effort_limit")
         self.force_limit[rows] = limit
-        for field in ("actuator_forcerange", "actuator_ctrlrange"):
+        for field, columns in (
+            ("actuator_forcerange", self.global_element_ids),
+            ("actuator_ctrlrange", self.global_ctrl_ids),
+        ):
             values = getattr(self._model, field)
             # One row that stands for all environments cannot hold a limit of one of them.
             if not isinstance(values, SharedField):
                 ranges = torch.stack((-limit, limit), dim=-1).to(values.dtype)
-                values[rows[:, None], self.global_ctrl_ids] = ranges
+                values[rows[:, None], columns] = ranges
 
 
 def _rows_of(parameter: torch.Tensor) -> tuple[int, torch.device]:

@@ -12,7 +12,7 @@ import mujoco
 from mjlab.actuator.actuator import ActuatorCfg, TransmissionType
 from mjlab.actuator.direct import DirectActuator
 from mjlab.compat import older_names
-from mjlab.utils.mujoco import CommandField, detect_command_field
+from mjlab.utils.mujoco import CommandField, control_inputs, detect_command_field
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -31,7 +31,8 @@ class XmlActuatorCfg(ActuatorCfg):
     """Take over actuators of the XML, see `XmlActuator`."""
 
     command_field: CommandField | None = None
-    """What the controls are: position, velocity or effort. None detects it from each actuator."""
+    """What the controls are: position, velocity or effort. None detects it from each actuator, and
+    is required for actuators with several controls."""
 
     def validate(self) -> None:
         """See `ActuatorCfg`."""
@@ -45,13 +46,14 @@ class XmlActuatorCfg(ActuatorCfg):
 
 
 class XmlActuator(DirectActuator[XmlActuatorCfg]):
-    """The first actuator of the XML on each target, passed the command that its kind reads.
+    """The first actuator of the XML on each target, passed the commands that its kind reads.
 
-    Targets without an actuator are left out. Armature, friction loss and damping of the config are
+    `<pid>` and `<dcmotor>` may read several: position, velocity, and an effort or voltage. Targets
+    without an actuator are left out. Armature, friction loss and damping of the config are
     written to the others, as for every kind.
     """
 
-    _transient = {"_command_field"}
+    _transient = {"_command_fields"}
 
     def __init__(
         self,
@@ -62,25 +64,26 @@ class XmlActuator(DirectActuator[XmlActuatorCfg]):
     ) -> None:
         """See `Actuator`."""
         super().__init__(cfg, entity, target_ids, target_names)
-        self._command_field: CommandField | None = cfg.command_field
+        field = cfg.command_field
+        self._command_fields: tuple[CommandField, ...] = () if field is None else (field,)
 
     @property
     def command_field(self) -> CommandField:
-        """What the controls are: "position", "velocity" or "effort".
+        """The first of `command_fields`, and the only one of most kinds."""
+        return self.command_fields[0]
+
+    @property
+    def command_fields(self) -> tuple[CommandField, ...]:
+        """Commands that every element reads: "position", "velocity", "effort".
 
         Raises `RuntimeError` before `edit_spec`, unless the config states it.
         """
-        if self._command_field is None:
+        if not self._command_fields:
             raise RuntimeError(
                 f"The kind of the XML actuators on {self._target_names} is not known yet; it is "
                 "detected when the entity is built."
             )
-        return self._command_field
-
-    @property
-    def command_fields(self) -> tuple[CommandField, ...]:
-        """The one command that all elements read."""
-        return (self.command_field,)
+        return self._command_fields
 
     def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
         """Find the elements for `target_names`; all targets have to be given at once.
@@ -94,11 +97,12 @@ class XmlActuator(DirectActuator[XmlActuatorCfg]):
         if not kept:
             raise ValueError(self._nothing_found(spec, target_names))
         self._mjs_actuators = [found[target_names[k]] for k in kept]
-        self._command_field = self._agreed_field()
-        if self.transmission_type == TransmissionType.SITE and self._command_field != "effort":
+        self._command_fields = self._agreed_fields()
+        unknown = [field for field in self._command_fields if field != "effort"]
+        if self.transmission_type == TransmissionType.SITE and unknown:
             warnings.warn(
-                f"The XML actuators on the sites {target_names} read a {self._command_field}, but "
-                "sites have effort targets only, so their control stays 0.",
+                f"The XML actuators on the sites {target_names} read a {' and a '.join(unknown)}, "
+                "but sites have effort targets only, so their control stays 0.",
                 UserWarning,
                 stacklevel=2,
             )
@@ -115,30 +119,38 @@ class XmlActuator(DirectActuator[XmlActuatorCfg]):
                 found.setdefault(element.target, element)
         return found
 
-    def _agreed_field(self) -> CommandField:
+    def _agreed_fields(self) -> tuple[CommandField, ...]:
         stated = self.cfg.command_field
-        detected: dict[CommandField, list[str]] = defaultdict(list)
+        detected: dict[tuple[CommandField, ...], list[str]] = defaultdict(list)
         for element in self._mjs_actuators:
-            try:
-                field = detect_command_field(element)
-            except ValueError:
-                # Detection does not know every kind; what the config states is trusted then.
-                if stated is None:
-                    raise
-                field = stated
-            detected[field].append(element.name or element.target)
-        breakdown = "; ".join(f"{field}: {names}" for field, names in detected.items())
+            detected[self._fields_of(element)].append(element.name or element.target)
+        breakdown = "; ".join(f"{', '.join(fields)}: {names}" for fields, names in detected.items())
         if len(detected) > 1:
             raise ValueError(
                 f"XmlActuatorCfg for {self.cfg.target_names_expr} matches actuators of several "
                 f"kinds ({breakdown}). Use one config for each kind."
             )
-        if stated is not None and stated not in detected:
+        if stated is not None and (stated,) not in detected:
             raise ValueError(
                 f"XmlActuatorCfg for {self.cfg.target_names_expr} has command_field={stated!r}, "
                 f"but the XML has {breakdown}. Leave command_field out to follow the XML."
             )
         return next(iter(detected))
+
+    def _fields_of(self, element: mujoco.MjsActuator) -> tuple[CommandField, ...]:
+        inputs = control_inputs(element)
+        if inputs == (None,):
+            # Detection does not know every kind; what the config states is trusted then.
+            return (self.cfg.command_field or detect_command_field(element),)
+        known = tuple(field for field in inputs if field is not None)
+        if not inputs or len(set(known)) < len(inputs):
+            kinds = ", ".join(field or "orientation" for field in inputs) or "none"
+            raise ValueError(
+                f"XmlActuatorCfg for {self.cfg.target_names_expr}: expected at most one position, "
+                f"velocity and effort input, got {kinds} on {element.name or element.target!r}; "
+                "use other patterns, and write its controls by Entity.write_ctrl_to_sim."
+            )
+        return known
 
     def _nothing_found(self, spec: mujoco.MjSpec, target_names: list[str]) -> str:
         existing = [

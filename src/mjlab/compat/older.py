@@ -206,7 +206,7 @@ def reward_weight(
     for stage in weight_stages:
         if env.common_step_counter > stage["step"]:
             cfg.weight = stage["weight"]
-    return torch.tensor([cfg.weight])
+    return torch.tensor([cfg.weight], dtype=torch.float32)
 
 
 def flat_orientation(

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import mujoco
 
-from mjlab.utils.mujoco import dof_width, qpos_width
+from mjlab.utils.mujoco import control_inputs, dof_width, qpos_width
 
 GeomRole = Literal["visual", "collision"]
 
@@ -164,7 +164,9 @@ def _structure(spec: mujoco.MjSpec) -> dict[str, list[Any]]:
         "sites": of_bodies(lambda b: [site.name for site in b.sites]),
         "cameras": of_bodies(lambda b: [camera.name for camera in b.cameras]),
         "lights": of_bodies(lambda b: [light.name for light in b.lights]),
-        "actuators": [(a.name, a.trntype.name, a.target) for a in spec.actuators],
+        "actuators": [
+            (a.name, a.trntype.name, a.target, len(control_inputs(a))) for a in spec.actuators
+        ],
         "sensors": [(s.name, s.type.name, s.objname) for s in spec.sensors],
         "tendons": [tendon.name for tendon in spec.tendons],
         "equalities": [(e.name, e.type.name, e.name1, e.name2) for e in spec.equalities],

@@ -10,7 +10,7 @@ import numpy as np
 from mjlab.entity.indexing import element_id
 from mjlab.sim.field_lists import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
 from mjlab.sim.variants import VariantColumns
-from mjlab.utils.mujoco import dof_width, qpos_width
+from mjlab.utils.mujoco import control_columns, dof_width, force_columns, qpos_width
 
 # Kinds of elements, with the beginning of the names of their model fields.
 KINDS = {
@@ -37,6 +37,9 @@ _WHOLE_FIGURES = frozenset(
 _DERIVED = frozenset({"body_margin", "dof_length", "dof_M0", "actuator_length0"}) | (
     frozenset((*FIXED_CONSTANTS, *CONSTANTS_AT_QPOS0)) - {"actuator_biasprm", "eq_data"}
 )
+# One row a control, or a force, of which an actuator may have several.
+_CONTROL_FIELDS = frozenset({"actuator_ctrllimited", "actuator_ctrlrange"})
+_FORCE_FIELDS = frozenset({"actuator_gear", "actuator_lengthrange"})
 _ASSET_FIELDS = {
     "geom_matid": ("materials", mujoco.mjtObj.mjOBJ_MATERIAL),
     "site_matid": ("materials", mujoco.mjtObj.mjOBJ_MATERIAL),
@@ -101,7 +104,7 @@ class VariantTable:
                     values = [assets[name][j][i] for (j, _), i in zip(sources, values, strict=True)]
                 if len(values):
                     fields[name] = ids[kind], np.stack(values)
-        fields |= self._by_address(k, model, ids["joints"])
+        fields |= self._by_address(k, model, ids["joints"], ids["actuators"])
         # Where the root starts is the entity's initial state, the same for all.
         for name in ("body_pos", "body_quat"):
             targets, values = fields[name]
@@ -121,34 +124,46 @@ class VariantTable:
             name
             for name in names
             if isinstance(array := getattr(model, name), np.ndarray)
-            and name not in _DERIVED
+            and name not in _DERIVED | _CONTROL_FIELDS | _FORCE_FIELDS
             and (array.dtype.kind == "f" or name in _WHOLE_FIGURES or name in _ASSET_FIELDS)
         ]
 
     def _by_address(
-        self, k: int, model: mujoco.MjModel, joints: np.ndarray
+        self, k: int, model: mujoco.MjModel, joints: np.ndarray, actuators: np.ndarray
     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Return the fields with rows for degrees of freedom and for positions."""
+        """Return the fields with rows for degrees of freedom, positions, controls and forces."""
         own = self._models[k]
-        places: dict[str, list[tuple[int, int]]] = {"dof": [], "qpos": []}
+        there = [ids[k] for _, ids in self._elements["actuators"]]
+        places: dict[str, list[tuple[int, int]]] = {
+            "dof": [],
+            "qpos": [],
+            "control": _pairs(control_columns(model, actuators), control_columns(own, there)),
+            "force": _pairs(force_columns(model, actuators), force_columns(own, there)),
+        }
         for joint, (_, ids) in zip(joints, self._elements["joints"], strict=True):
-            kind, there = int(model.jnt_type[joint]), ids[k]
+            kind, joint_there = int(model.jnt_type[joint]), ids[k]
             for j in range(dof_width(kind)):
-                places["dof"].append((model.jnt_dofadr[joint] + j, own.jnt_dofadr[there] + j))
+                places["dof"].append((model.jnt_dofadr[joint] + j, own.jnt_dofadr[joint_there] + j))
             if kind != mujoco.mjtJoint.mjJNT_FREE:
                 for j in range(qpos_width(kind)):
                     places["qpos"].append(
-                        (model.jnt_qposadr[joint] + j, own.jnt_qposadr[there] + j)
+                        (model.jnt_qposadr[joint] + j, own.jnt_qposadr[joint_there] + j)
                     )
         names = {"qpos0": "qpos", "qpos_spring": "qpos"}
         names |= {name: "dof" for name in dir(own) if name.startswith("dof_")}
+        names |= dict.fromkeys(_CONTROL_FIELDS, "control") | dict.fromkeys(_FORCE_FIELDS, "force")
         fields = {}
         for name, kind in names.items():
             array = getattr(own, name)
-            if places[kind] and array.dtype.kind == "f" and name not in _DERIVED:
-                here, there = np.array(places[kind], dtype=int).T
-                fields[name] = here, array[there]
+            is_figure = array.dtype.kind == "f" or name in _WHOLE_FIGURES
+            if places[kind] and is_figure and name not in _DERIVED:
+                here, rows = np.array(places[kind], dtype=int).T
+                fields[name] = here, array[rows]
         return fields
+
+
+def _pairs(here: list[int], there: list[int]) -> list[tuple[int, int]]:
+    return list(zip(here, there, strict=True))
 
 
 def _first_with(ids: list[int], k: int) -> tuple[int, int]:

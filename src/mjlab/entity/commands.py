@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.entity.indexing import Ids
-from mjlab.entity.state_writer import EnvIds, assign, check_width
+from mjlab.entity.state_writer import EnvIds, as_values, assign
 
 if TYPE_CHECKING:
     from mjlab.entity.data import EntityData
@@ -18,8 +18,9 @@ class EntityCommands:
     """The setters and writers of `Entity`.
 
     `env_ids` is None (all), a slice, a boolean mask or a one-dimensional tensor of indices; element
-    ids count within the entity and may also be a list. Tensors of both select their product. All
-    raise `ValueError` if a width is wrong or the entity has no such elements.
+    ids count within the entity and may also be a list. Tensors of both select their product. Values
+    are tensors or arrays of any float type. All raise `ValueError` if a width is wrong or the entity
+    has no such elements.
 
     Setters store a target for the next `write_data_to_sim`; writers change the simulation now, and
     what derives from the state follows at the next `sim.forward()`.
@@ -146,7 +147,7 @@ class EntityCommands:
     def write_ctrl_to_sim(
         self, ctrl: torch.Tensor, ctrl_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Write controls (k, number of actuators)."""
+        """Write controls (k, number of controls)."""
         self.data.write_ctrl(ctrl, ctrl_ids, env_ids)
 
     def write_mocap_pose_to_sim(self, mocap_pose: torch.Tensor, env_ids: EnvIds = None) -> None:
@@ -173,5 +174,5 @@ def _set_target(
         if columns.dtype == torch.bool:
             columns = columns.nonzero().flatten()
         width = columns.shape[0]
-    check_width(value, width, f"The {what} target", broadcasts=True)
-    assign(target, value, env_ids, columns)
+    values = as_values(value, width, f"The {what} target", str(target.device), broadcasts=True)
+    assign(target, values, env_ids, columns)

@@ -150,8 +150,11 @@ class EntityData(KinematicsReader, StateWriter):
 
     @property
     def actuator_force(self) -> torch.Tensor:
-        """(N, number of actuators) scalar force of each actuator, before its gear."""
-        return self._columns("actuator_force", self._ctrl)
+        """(N, number of forces) forces of the actuators in turn, before their gear.
+
+        An orientation servo has three, every other actuator one; see `indexing.force_columns`.
+        """
+        return self._columns("actuator_force", self._forces)
 
     @property
     def qfrc_actuator(self) -> torch.Tensor:

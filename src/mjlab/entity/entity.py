@@ -76,8 +76,8 @@ class EntityCfg:
 
     init_state: InitialStateCfg = field(default_factory=InitialStateCfg)
     """The initial state."""
-    spec_fn: Callable[[], mujoco.MjSpec] = field(default_factory=lambda: lambda: mujoco.MjSpec())
-    """Makes the MuJoCo spec of the entity, a new one at each call."""
+    spec_fn: Callable[[], mujoco.MjSpec] = field(default_factory=lambda: mujoco.MjSpec)
+    """Returns the MuJoCo spec of the entity, which is copied."""
     articulation: EntityArticulationInfoCfg | None = None
     """Actuators and soft joint limits."""
     sort_actuators: bool = False
@@ -139,7 +139,8 @@ class Entity(NamedElements, EntityCommands):
                 f"EntityCfg.spec_fn returned {type(spec).__name__}; it must return a "
                 "mujoco.MjSpec, such as mujoco.MjSpec.from_file(path)."
             )
-        return spec
+        # Editors change it, a scene takes it in, and a function might return one spec twice.
+        return spec.copy()
 
     def _placeable(self, spec: mujoco.MjSpec) -> mujoco.MjSpec:
         """Return `spec` under a mocap body, if its base is fixed."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -9,7 +10,7 @@ from typing import Any, TypeAlias
 import mujoco
 import torch
 
-from mjlab.utils.mujoco import dof_width, qpos_width
+from mjlab.utils.mujoco import control_columns, dof_width, force_columns, qpos_width
 
 Ids: TypeAlias = torch.Tensor | slice | Sequence[int] | None
 """A selection: None for all, a slice, or whole numbers (list, tensor) or a boolean mask."""
@@ -81,8 +82,12 @@ class EntityIndexing:
     mat_ids: torch.Tensor
     tex_ids: torch.Tensor
     pair_ids: torch.Tensor
-    ctrl_ids: torch.Tensor
+    actuator_ids: torch.Tensor
     """Ids of `actuators`; empty if that is None."""
+    ctrl_ids: torch.Tensor
+    """Columns of `ctrl` of `actuators` in turn; an actuator may have none, one or several."""
+    force_ids: torch.Tensor
+    """Columns of `actuator_force` of `actuators` in turn; three for an orientation, else one."""
     joint_ids: torch.Tensor
     mocap_id: int | None
     """Index into `mocap_pos`, or None if the root is no mocap body."""
@@ -105,12 +110,31 @@ class EntityIndexing:
     site_tree_ids: torch.Tensor
     """For each site, the top-level body of its tree."""
 
+    def force_columns(
+        self, actuator_ids: Sequence[int] | torch.Tensor | slice | int
+    ) -> Sequence[int] | torch.Tensor | slice | int:
+        """Return the columns of `EntityData.actuator_force` of some of the entity's actuators."""
+        forces = self._forces
+        if all(len(own) == 1 for own in forces):
+            return actuator_ids
+        if isinstance(actuator_ids, torch.Tensor):
+            mask = actuator_ids.dtype == torch.bool
+            actuator_ids = (actuator_ids.nonzero().flatten() if mask else actuator_ids).tolist()
+        if isinstance(actuator_ids, slice):
+            chosen = forces[actuator_ids]
+        else:
+            ids = (actuator_ids,) if isinstance(actuator_ids, int) else actuator_ids
+            chosen = tuple(forces[i] for i in ids)
+        return [column for own in chosen for column in own]
+
     @property
     def root_body_id(self) -> int:
         """Global id of the root body."""
         return self._root_id
 
     _root_id: int = -1
+    _forces: tuple[range, ...] = ()
+    """For each of `actuators`, its columns among `force_ids`."""
 
 
 def build_indexing(
@@ -136,7 +160,9 @@ def build_indexing(
     }
     actuators = elements.pop("actuators")
     ids = {kind: element_ids(model, kind, found) for kind, found in elements.items()}
-    ctrl_ids = element_ids(model, "actuators", actuators) if is_actuated else []
+    actuator_ids = element_ids(model, "actuators", actuators) if is_actuated else []
+    widths = [int(model.actuator_outnum[i]) for i in actuator_ids]
+    stops = tuple(itertools.accumulate(widths))
     joints = [(int(model.jnt_type[i]), i) for i in ids["joints"]]
     free = [] if free_joint is None else element_ids(model, "joints", (free_joint,))
     geom_bodies = [int(model.geom_bodyid[i]) for i in ids["geoms"]]
@@ -155,7 +181,9 @@ def build_indexing(
         mat_ids=tensor(ids["materials"]),
         tex_ids=tensor(ids["textures"]),
         pair_ids=tensor(ids["pairs"]),
-        ctrl_ids=tensor(ctrl_ids),
+        actuator_ids=tensor(actuator_ids),
+        ctrl_ids=tensor(control_columns(model, actuator_ids)),
+        force_ids=tensor(force_columns(model, actuator_ids)),
         joint_ids=tensor(ids["joints"]),
         mocap_id=mocap_id if mocap_id >= 0 else None,
         joint_q_adr=tensor(
@@ -172,6 +200,7 @@ def build_indexing(
         site_body_ids=tensor(site_bodies),
         site_tree_ids=tensor(model.body_rootid[i] for i in site_bodies),
         _root_id=root,
+        _forces=tuple(range(stop - n, stop) for stop, n in zip(stops, widths, strict=True)),
     )
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import mujoco
 
-from mjlab.utils.mujoco import is_position_actuator, qpos_width
+from mjlab.utils.mujoco import control_inputs, qpos_width
 from mjlab.utils.string import resolve_expr
 
 if TYPE_CHECKING:
@@ -38,8 +38,8 @@ class InitialState:
     joint_vel: tuple[float, ...]
     qpos: dict[mujoco.MjsJoint, tuple[float, ...]]
     """The values of each joint, the free one included, in spec order."""
-    ctrl: dict[mujoco.MjsActuator, float]
-    """The control of each actuator, in spec order."""
+    ctrl: dict[mujoco.MjsActuator, tuple[float, ...]]
+    """The controls of each actuator, in spec order."""
 
 
 def take_keys(spec: mujoco.MjSpec) -> XmlKey | None:
@@ -112,7 +112,11 @@ def add_key(spec: mujoco.MjSpec, states: list[InitialState]) -> None:
     for joint in spec.joints:
         values = known_joints.get(joint)
         qpos.extend(_reference(joint) if values is None else values)
-    ctrl = [known_ctrl.get(actuator, 0.0) for actuator in spec.actuators]
+    ctrl = [
+        value
+        for actuator in spec.actuators
+        for value in known_ctrl.get(actuator) or (0.0,) * len(control_inputs(actuator))
+    ]
     spec.add_key(name=KEY_NAME, qpos=qpos, ctrl=ctrl)
 
 
@@ -140,19 +144,23 @@ def _ctrl(
     joints: tuple[mujoco.MjsJoint, ...],
     joint_pos: tuple[float, ...],
     key: XmlKey | None,
-) -> dict[mujoco.MjsActuator, float]:
+) -> dict[mujoco.MjsActuator, tuple[float, ...]]:
     """Return the controls that hold the joints at `joint_pos`, or those of a keyframe."""
     positions = {joint.name: value for joint, value in zip(joints, joint_pos, strict=True)}
-    ctrl = {}
-    for index, actuator in enumerate(spec.actuators):
+    known = key.ctrl if key is not None else ()
+    ctrl, start = {}, 0
+    for actuator in spec.actuators:
+        inputs = control_inputs(actuator)
+        stop = start + len(inputs)
         # The actuators that the XML itself has come first, in the order of its keyframe.
-        if key is not None and index < len(key.ctrl):
-            ctrl[actuator] = float(key.ctrl[index])
-        elif actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and is_position_actuator(actuator):
-            ctrl[actuator] = positions.get(actuator.target, 0.0)
+        if stop <= len(known):
+            ctrl[actuator] = tuple(map(float, known[start:stop]))
         else:
             # A joint position is no sensible force, speed or activation.
-            ctrl[actuator] = 0.0
+            on_joint = actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT
+            held = positions.get(actuator.target, 0.0) if on_joint else 0.0
+            ctrl[actuator] = tuple(held if what == "position" else 0.0 for what in inputs)
+        start = stop
     return ctrl
 
 

@@ -61,6 +61,7 @@ class KinematicsReader:
         self._site_trees = Addresses(ix.site_tree_ids, device)
         self._tendons = Addresses(ix.tendon_ids, device)
         self._ctrl = Addresses(ix.ctrl_ids, device)
+        self._forces = Addresses(ix.force_ids, device)
         self._root = Addresses([ix.root_body_id], device)
         # A free joint's addresses always follow each other.
         start_q, start_v = ix.free_joint_q_adr[:1].tolist(), ix.free_joint_v_adr[:1].tolist()

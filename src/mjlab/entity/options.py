@@ -60,11 +60,8 @@ class EntityOptions:
     """For each of `BIT_FIELDS`: (bits that are set, bits about which the spec says anything)."""
 
 
-def take_options(spec: mujoco.MjSpec) -> EntityOptions:
-    """Return the options that `spec` states, and put its `<option>` back to MuJoCo's defaults.
-
-    Without the second, MuJoCo would warn at every attachment about values that are not lost.
-    """
+def stated_options(spec: mujoco.MjSpec) -> EntityOptions:
+    """Return the options that `spec` states."""
     default = mujoco.MjSpec().option
     values = {
         name: _plain(getattr(spec.option, name))
@@ -81,12 +78,21 @@ def take_options(spec: mujoco.MjSpec) -> EntityOptions:
         stated = bits | int(getattr(spec.authored, name))
         if stated:
             switches[name] = (bits, stated)
+    return EntityOptions(values, switches)
+
+
+def take_options(spec: mujoco.MjSpec) -> EntityOptions:
+    """Return the options that `spec` states, and put its `<option>` back to MuJoCo's defaults.
+
+    Without the second, MuJoCo would warn at every attachment about values that are not lost.
+    """
+    options, default = stated_options(spec), mujoco.MjSpec().option
     for name in _AUTHORED_ORDER:
         write_option(spec.option, name, getattr(default, name))
     spec.authored.option = 0
     for name in BIT_FIELDS:
         setattr(spec.authored, name, 0)
-    return EntityOptions(values, switches)
+    return options
 
 
 def write_option(option: Any, name: str, value: Any) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from mjlab.entity.indexing import Addresses, Ids
@@ -18,7 +19,7 @@ EnvIds = torch.Tensor | slice | None
 
 def assign(
     field: torch.Tensor,
-    value: torch.Tensor | float,
+    value: torch.Tensor,
     env_ids: EnvIds,
     columns: slice | torch.Tensor | int,
 ) -> None:
@@ -36,17 +37,28 @@ def rows(field: torch.Tensor, env_ids: EnvIds) -> torch.Tensor:
     return field if env_ids is None else field[env_ids]
 
 
-def check_width(value: Any, width: int, what: str, broadcasts: bool = False) -> None:
-    """Raise `ValueError` unless the last dimension of a tensor `value` is `width`.
+def as_values(
+    value: Any, width: int, what: str, device: str, broadcasts: bool = False
+) -> torch.Tensor:
+    """Return a tensor, array or number as float32, whose last dimension has to be `width`.
 
     With `broadcasts` it may be 1: one value for all elements.
+
+    Raises:
+        ValueError: the width is another.
     """
+    if not isinstance(value, torch.Tensor):
+        # Copied, because torch warns about arrays that it may not write to.
+        value = torch.as_tensor(np.array(value), dtype=torch.float32, device=device)
+    elif value.dtype != torch.float32:
+        value = value.to(device, torch.float32)
     widths = (1, width) if broadcasts else (width,)
-    if isinstance(value, torch.Tensor) and value.ndim > 0 and value.shape[-1] not in widths:
+    if value.ndim > 0 and value.shape[-1] not in widths:
         raise ValueError(
             f"{what} has {value.shape[-1]} values per environment (shape {tuple(value.shape)}), "
             f"but {width} are to be written. Give a tensor of shape (number of envs, {width})."
         )
+    return value
 
 
 def _row_numbers(env_ids: torch.Tensor) -> torch.Tensor:
@@ -59,6 +71,7 @@ class StateWriter:
 
     `env_ids` is None (all), a slice, a boolean mask or a one-dimensional tensor of indices; element
     ids, which count within the entity, may also be a list. Tensors of both select their product.
+    Values are tensors or arrays of any float type; the simulation holds float32.
 
     Writes go straight to the simulation. What derives from the state (`body_link_pos_w`, velocities
     of links, sensors, ...) keeps its old values until the next `sim.forward()`.
@@ -67,6 +80,7 @@ class StateWriter:
     indexing: EntityIndexing
     data: Any
     model: Any
+    device: str
     is_fixed_base: bool
     is_articulated: bool
     is_actuated: bool
@@ -80,7 +94,7 @@ class StateWriter:
     def write_root_state(self, root_state: torch.Tensor, env_ids: EnvIds = None) -> None:
         """Write pose and velocity of the root link, (k, 13): see the next two writers."""
         self._require_floating("write_root_state")
-        check_width(root_state, 13, "The root state")
+        root_state = as_values(root_state, 13, "The root state", self.device)
         self.write_root_pose(root_state[..., :7], env_ids)
         self.write_root_velocity(root_state[..., 7:], env_ids)
 
@@ -91,7 +105,7 @@ class StateWriter:
             ValueError: the entity has a fixed base, or the width is wrong.
         """
         self._require_floating("write_root_pose")
-        check_width(pose, 7, "The root pose")
+        pose = as_values(pose, 7, "The root pose", self.device)
         assign(self.data.qpos, pose, env_ids, self._free_q)
 
     def write_root_velocity(self, velocity: torch.Tensor, env_ids: EnvIds = None) -> None:
@@ -153,7 +167,7 @@ class StateWriter:
         """
         self._require_articulated("write_joint_position")
         columns, width = self._joint_q.select(joint_ids)
-        check_width(position, width, "The joint position", broadcasts=True)
+        position = as_values(position, width, "The joint position", self.device, broadcasts=True)
         assign(self.data.qpos, position, env_ids, columns)
 
     def write_joint_velocity(
@@ -166,7 +180,7 @@ class StateWriter:
         """
         self._require_articulated("write_joint_velocity")
         columns, width = self._joint_v.select(joint_ids)
-        check_width(velocity, width, "The joint velocity", broadcasts=True)
+        velocity = as_values(velocity, width, "The joint velocity", self.device, broadcasts=True)
         assign(self.data.qvel, velocity, env_ids, columns)
 
     def write_external_wrench(
@@ -185,11 +199,14 @@ class StateWriter:
         wrench = self.data.xfrc_applied
         for value, half, what in ((force, slice(0, 3), "force"), (torque, slice(3, 6), "torque")):
             if value is not None:
-                check_width(value, 3, f"The external {what}")
-                assign(wrench[..., half], value, env_ids, columns)
+                values = as_values(value, 3, f"The external {what}", self.device)
+                assign(wrench[..., half], values, env_ids, columns)
 
     def write_ctrl(self, ctrl: torch.Tensor, ctrl_ids: Ids = None, env_ids: EnvIds = None) -> None:
-        """Write controls, (k, number of actuators); `ctrl_ids` count within the entity.
+        """Write controls, (k, number of controls); `ctrl_ids` count within the entity.
+
+        Every actuator of the entity has its controls in turn: most have one, `<pid>`, `<dcmotor>`
+        and `<orientation>` may have several.
 
         Raises:
             ValueError: the entity has no configured actuators, or the width is wrong.
@@ -200,7 +217,7 @@ class StateWriter:
                 "EntityCfg.articulation.actuators."
             )
         columns, width = self._ctrl.select(ctrl_ids)
-        check_width(ctrl, width, "The control", broadcasts=True)
+        ctrl = as_values(ctrl, width, "The control", self.device, broadcasts=True)
         assign(self.data.ctrl, ctrl, env_ids, columns)
 
     def write_mocap_pose(self, pose: torch.Tensor, env_ids: EnvIds = None) -> None:
@@ -215,7 +232,7 @@ class StateWriter:
                 "write_mocap_pose: the root of this entity is no mocap body. Place a floating "
                 "entity with write_root_pose."
             )
-        check_width(pose, 7, "The mocap pose")
+        pose = as_values(pose, 7, "The mocap pose", self.device)
         assign(self.data.mocap_pos, pose[..., :3], env_ids, mocap_id)
         assign(self.data.mocap_quat, pose[..., 3:], env_ids, mocap_id)
 
@@ -227,7 +244,7 @@ class StateWriter:
         Raises `ValueError`, naming the writer `what`, for a fixed base or a wrong width.
         """
         self._require_floating(what)
-        check_width(velocity, 6, "The root velocity")
+        velocity = as_values(velocity, 6, "The root velocity", self.device)
         quat = rows(self.data.qpos[:, self._free_q], env_ids)[:, 3:7]
         halves = velocity.expand(len(quat), 6)
         return quat, halves[:, :3], halves[:, 3:]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import functools
 import logging
 import math
@@ -145,11 +144,10 @@ class ManagerBasedRlEnv:
     # Construction.
 
     def _create_simulation(self) -> Simulation:
-        # The XML of an entity may ask for options that nobody contradicts.
-        mujoco_cfg = self.scene.resolve_mujoco_cfg(self.cfg.sim.mujoco)
+        self.scene.report_overruled_options(self.cfg.sim.mujoco)
         return Simulation(
             self.num_envs,
-            dataclasses.replace(self.cfg.sim, mujoco=mujoco_cfg),
+            self.cfg.sim,
             device=self._device,
             spec=self.scene.spec,
             variant_info=self.scene.collect_variant_info(),
@@ -373,7 +371,7 @@ class ManagerBasedRlEnv:
         """Return the time that passed for commands: none where an episode has just begun."""
         if len(reset_ids) == 0:
             return self.step_dt
-        dt = torch.full((self.num_envs,), self.step_dt, device=self.device)
+        dt = torch.full((self.num_envs,), self.step_dt, dtype=torch.float32, device=self.device)
         dt[reset_ids] = 0.0
         return dt
 

@@ -86,7 +86,7 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
         super().__init__(cfg, env)
         size = (3, self.num_envs, self.total_action_dim)
         # Newest first, in one tensor, so that a reset clears all three at once.
-        self._history = torch.zeros(size, device=self.device)
+        self._history = torch.zeros(size, dtype=torch.float32, device=self.device)
         self._action, self._prev_action, self._prev_prev_action = self._history
         self._action_parts = self._action.split(self.action_term_dim, dim=1)
         self._check_finite = finite_action_check(self.num_envs, self.total_action_dim, self.device)

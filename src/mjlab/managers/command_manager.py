@@ -64,7 +64,7 @@ class CommandTerm(ManagerTermBase):
         self.cfg = cfg
         self._check()
         self.metrics: dict[str, torch.Tensor] = {}
-        self.time_left = torch.zeros(self.num_envs, device=self.device)
+        self.time_left = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self.command_counter = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
 
     @property
@@ -147,7 +147,9 @@ class CommandTerm(ManagerTermBase):
 
     def _resample(self, env_ids: torch.Tensor) -> None:
         low, high = self.cfg.resampling_time_range
-        times = torch.rand(len(env_ids), device=self.device) * (high - low) + low
+        times = (
+            torch.rand(len(env_ids), dtype=torch.float32, device=self.device) * (high - low) + low
+        )
         self.time_left[env_ids] = times
         self._resample_command(env_ids)
         self.command_counter[env_ids] += 1

@@ -224,7 +224,7 @@ class EventManager(TermFunctionSwitches, TermListManager):
 
     def _draw(self, cfg: EventTermCfg, count: int) -> torch.Tensor:
         low, high = cfg.interval_range_s or (0.0, 0.0)
-        return torch.rand(count, device=self.device) * (high - low) + low
+        return torch.rand(count, dtype=torch.float32, device=self.device) * (high - low) + low
 
     def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
         terms = zip(self._term_names, self._term_cfgs, strict=True)

@@ -46,7 +46,7 @@ class DeferredCheck:
     def __init__(self, num_envs: int, action_dim: int, device: str, event: Any) -> None:
         self._event = event
         self._bad = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        self._values = torch.zeros(num_envs, action_dim, device=device)
+        self._values = torch.zeros(num_envs, action_dim, dtype=torch.float32, device=device)
         pinned = torch.device(device).type == "cuda"
         self._flag = torch.zeros((), dtype=torch.bool, pin_memory=pinned)
         self._pending = False

@@ -44,13 +44,15 @@ class MetricsManager(TermListManager):
     def __init__(self, cfg: Mapping[str, MetricsTermCfg | None], env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         size = (len(self._term_names), self.num_envs)
-        self._last = torch.zeros(size, device=self.device)
-        self._sum = torch.zeros(size, device=self.device)
-        self._max = torch.full(size, -torch.inf, device=self.device)
-        self._steps = torch.zeros(self.num_envs, device=self.device)
+        self._last = torch.zeros(size, dtype=torch.float32, device=self.device)
+        self._sum = torch.zeros(size, dtype=torch.float32, device=self.device)
+        self._max = torch.full(size, -torch.inf, dtype=torch.float32, device=self.device)
+        self._steps = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._rows = list(self._last)
         substep_terms = [k for k, c in enumerate(self._term_cfgs) if c.per_substep]
-        self._substep_sums = torch.zeros(len(substep_terms), self.num_envs, device=self.device)
+        self._substep_sums = torch.zeros(
+            len(substep_terms), self.num_envs, dtype=torch.float32, device=self.device
+        )
         self._substep_rows = dict(zip(substep_terms, self._substep_sums, strict=True))
         self._substeps = 0
         self._terms_by_reduce = self._group_by_reduce()

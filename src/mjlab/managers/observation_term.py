@@ -154,7 +154,8 @@ class ObservationTerm:
                 f"Observation term {self.label!r} returned shape {tuple(value.shape)}, but "
                 f"{tuple(self._raw_shape)} when the environment was built. Shapes must not change."
             )
-        return value
+        # Policies are float32, whatever the default type with which a term makes its tensors.
+        return value.float() if value.dtype == torch.float64 else value
 
     def _check_first(self, value: Any) -> None:
         expected = f"({self._env.num_envs}, ...), with one or more dimensions after the first"

@@ -58,9 +58,9 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         super().__init__(cfg, env)
         size = (len(self._term_names), self.num_envs)
         # Terms first, so that each term writes to memory without gaps.
-        self._rates = torch.zeros(size, device=self.device)
-        self._episode_sums = torch.zeros(size, device=self.device)
-        self._reward_buf = torch.zeros(self.num_envs, device=self.device)
+        self._rates = torch.zeros(size, dtype=torch.float32, device=self.device)
+        self._episode_sums = torch.zeros(size, dtype=torch.float32, device=self.device)
+        self._reward_buf = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._rows = list(self._rates)
         # Weighted rates (num_envs, terms) of the last step, not multiplied by its duration.
         self._step_reward = self._rates.t()

@@ -166,7 +166,7 @@ def _gains_by_joint(
     for actuator in entity.actuators:
         if str(getattr(actuator.transmission_type, "value", "joint")) != "joint":
             continue
-        elements = actuator.global_ctrl_ids.tolist()
+        elements = actuator.global_element_ids.tolist()
         for k, name in enumerate(actuator.target_names):
             # Elements of one target follow each other; the first holds the gains.
             element = elements[k * len(elements) // len(actuator.target_names)]

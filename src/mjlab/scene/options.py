@@ -1,7 +1,8 @@
-"""What becomes of the simulation options that entities ask for in their own XML.
+"""Simulation options in the XML of entities: decided by `MujocoCfg`, or applied to the scene.
 
-A scene has one `<option>`. What one entity asks for is applied if nobody contradicts it: no other
-entity, no `SceneCfg.spec_fn`, no `MujocoCfg`. A contradiction is reported by a `UserWarning`.
+`MujocoCfg` decides every option that it has a field for, whatever the XML says; its flags are added
+to those of the XML. Other options come from the XML, unless entities or `SceneCfg.spec_fn`
+contradict each other.
 """
 
 from __future__ import annotations
@@ -10,19 +11,19 @@ import dataclasses
 import logging
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from mjlab.entity.options import BIT_FIELDS, EntityOptions, write_option
-
-if TYPE_CHECKING:
-    from mjlab.sim import MujocoCfg
+from mjlab.sim.config import MujocoCfg
 
 logger = logging.getLogger(__name__)
 
-# Fields that MujocoCfg names as MuJoCo does, with the enum of those that it gives by name.
+_DECIDED = frozenset(field.name for field in dataclasses.fields(MujocoCfg)) - set(BIT_FIELDS)
+
+# Options that MujocoCfg gives by the name of a member of an enum.
 _ENUMS = {
     "integrator": (mujoco.mjtIntegrator, "mjINT_"),
     "cone": (mujoco.mjtCone, "mjCONE_"),
@@ -44,14 +45,15 @@ class OptionRequest:
 
 
 def merge_entity_options(options: dict[str, EntityOptions]) -> dict[str, OptionRequest]:
-    """Return what the entities ask for together: option field to request.
+    """Return what the entities ask for together, beyond what `MujocoCfg` decides.
 
     Fields about which entities disagree are left out, and reported by one `UserWarning`. Of sets of
     switches (flags), only the switches are left out about which they disagree.
     """
     merged: dict[str, OptionRequest] = {}
     conflicts: list[str] = []
-    for name in dict.fromkeys(name for own in options.values() for name in own.values):
+    names = dict.fromkeys(name for own in options.values() for name in own.values)
+    for name in (name for name in names if name not in _DECIDED):
         wishes = {entity: own.values[name] for entity, own in options.items() if name in own.values}
         if len(set(wishes.values())) == 1:
             merged[name] = OptionRequest(next(iter(wishes.values())), tuple(wishes))
@@ -63,8 +65,8 @@ def merge_entity_options(options: dict[str, EntityOptions]) -> dict[str, OptionR
     if conflicts:
         warnings.warn(
             "Entities ask in their XML for different simulation options. A scene has one of each, "
-            "so these are not applied:\n" + "\n".join(conflicts) + "\nSet them in MujocoCfg, or in "
-            "SceneCfg.spec_fn where MujocoCfg does not have them.",
+            "so these are not applied:\n" + "\n".join(conflicts) + "\nSet flags in MujocoCfg, and "
+            "the others in SceneCfg.spec_fn.",
             UserWarning,
             stacklevel=3,
         )
@@ -124,54 +126,44 @@ def drop_overridden(option: Any, requests: dict[str, OptionRequest]) -> dict[str
     return kept
 
 
-def resolve_mujoco_cfg(cfg: MujocoCfg, requests: dict[str, OptionRequest]) -> MujocoCfg:
-    """Return `cfg` with what entities ask for, where `cfg` leaves its own default.
+def report_overruled(cfg: MujocoCfg, stated: dict[str, EntityOptions]) -> None:
+    """Log what `cfg` decides otherwise than XMLs state, one line each with the assignment to copy.
 
-    A field of `cfg` that differs from its default and from what entities ask for keeps its value,
-    and is reported by a `UserWarning`. `cfg` itself is not changed.
+    Args:
+        cfg: The options that are in force.
+        stated: Options by where they are stated, such as "the XML of 'robot'".
     """
-    default = type(cfg)()
-    changes: dict[str, Any] = {}
-    overruled = []
-    for name, request in requests.items():
-        if name in BIT_FIELDS or not hasattr(cfg, name):
-            # Flags of both are added up, and the rest is on the spec already.
-            continue
-        wanted, current = _config_value(name, request.value), getattr(cfg, name)
-        if _same(current, wanted):
-            continue
-        if _same(current, getattr(default, name)):
-            changes[name] = wanted
-        else:
-            overruled.append(
-                f"  {name}: {current!r}, not {wanted!r} as {', '.join(request.entities)}"
-            )
-    if overruled:
-        warnings.warn(
-            "MujocoCfg sets options otherwise than the XML of an entity asks, and wins:\n"
-            + "\n".join(overruled)
-            + "\nRemove them from the XML to silence this.",
-            UserWarning,
-            stacklevel=3,
-        )
-    for name, value in changes.items():
-        logger.info(
-            "MujocoCfg.%s = %r, as the XML of %s asks.",
-            name, value, ", ".join(requests[name].entities),
-        )  # fmt: skip
-    return dataclasses.replace(cfg, **changes)
+    for source, options in stated.items():
+        for name, value in options.values.items():
+            if name in _DECIDED and not _same(getattr(cfg, name), _config_value(name, value)):
+                _report(source, name, getattr(cfg, name), _config_value(name, value))
+        for name in _FLAG_ENUMS:
+            bits, known = options.switches.get(name, (0, 0))
+            current, cleared = tuple(getattr(cfg, name)), _flags(name, known & ~bits)
+            kept = tuple(flag for flag in current if flag not in cleared)
+            if kept != current:
+                _report(source, name, current, kept)
+
+
+def _report(source: str, name: str, current: Any, wanted: Any) -> None:
+    logger.warning(
+        "Option %s is %r, from MujocoCfg; to follow %s, set sim.mujoco.%s = %r",
+        name, current, source, name, wanted,
+    )  # fmt: skip
 
 
 def show(name: str, value: Any) -> str:
     """Return an option's value as people write it."""
-    if name in _FLAG_ENUMS:
-        enum, prefix = _FLAG_ENUMS[name]
-        return str([
-            member.removeprefix(prefix).lower()
-            for member, bit in enum.__members__.items()
-            if member.startswith(prefix) and int(value) & int(bit)
-        ])  # fmt: skip
-    return str(_config_value(name, value))
+    return str(_flags(name, value) if name in _FLAG_ENUMS else _config_value(name, value))
+
+
+def _flags(name: str, bits: int) -> list[str]:
+    enum, prefix = _FLAG_ENUMS[name]
+    return [
+        member.removeprefix(prefix).lower()
+        for member, bit in enum.__members__.items()
+        if member.startswith(prefix) and int(bits) & int(bit)
+    ]
 
 
 def _config_value(name: str, value: Any) -> Any:

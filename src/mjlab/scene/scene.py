@@ -14,12 +14,13 @@ import torch
 
 from mjlab.entity import Entity, EntityCfg
 from mjlab.entity.initial_state import add_key
+from mjlab.entity.options import stated_options
 from mjlab.scene.base_spec import make_base_spec
 from mjlab.scene.options import (
     OptionRequest,
     drop_overridden,
     merge_entity_options,
-    resolve_mujoco_cfg,
+    report_overruled,
     write_requests,
 )
 from mjlab.sensor import (
@@ -93,7 +94,7 @@ class Scene:
             scene_cfg.spec_fn(self._spec)
             self.entity_options = drop_overridden(self._spec.option, self.entity_options)
         add_key(self._spec, [entity.initial_state for entity in self._entities.values()])
-        self._env_origins = torch.zeros(scene_cfg.num_envs, 3, device=device)
+        self._env_origins = torch.zeros(scene_cfg.num_envs, 3, dtype=torch.float32, device=device)
 
     # Composition.
 
@@ -244,15 +245,16 @@ class Scene:
             if entity.variant_metadata is not None
         ]
 
-    def resolve_mujoco_cfg(self, cfg: MujocoCfg) -> MujocoCfg:
-        """Return `cfg` with the options that entities ask for in their XML filled in.
+    def report_overruled_options(self, cfg: MujocoCfg) -> None:
+        """Log the options that `cfg` decides otherwise than the XML of an entity, or `spec_fn`.
 
-        A field that `cfg` leaves at its default takes what the entities ask for (logged). One that
-        `cfg` sets otherwise keeps its value, and a `UserWarning` says so. Options that `MujocoCfg`
-        does not have, and flags, are on `spec.option` since the scene was built. `cfg` itself is
-        not changed; use the result for the `SimulationCfg`.
+        `MujocoCfg` decides every option that it has; the others are on `spec.option` since the
+        scene was built, as the XML asks, and so are flags, to which those of `cfg` are added.
         """
-        return resolve_mujoco_cfg(cfg, self.entity_options)
+        stated = {f"the XML of {name!r}": e.options for name, e in self._entities.items()}
+        if self._cfg.spec_fn is not None:
+            stated["SceneCfg.spec_fn"] = stated_options(self._spec)
+        report_overruled(cfg, stated)
 
     # Life cycle.
 

@@ -65,7 +65,8 @@ def _build(scene_cfg: SceneCfg, options: MujocoCfg) -> Scene:
 
     scene = Scene(scene_cfg, "cpu")
     target: Any = SimpleNamespace(opt=scene.spec.option)
-    scene.resolve_mujoco_cfg(options).apply(target)
+    scene.report_overruled_options(options)
+    options.apply(target)
     return scene
 
 

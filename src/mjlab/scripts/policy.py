@@ -226,9 +226,11 @@ def constant_policy(env: Any, kind: str) -> Any:
 
     shape = (env.num_envs, env.num_actions)
     if kind == "zero":
-        zeros = torch.zeros(shape, device=env.device)
+        zeros = torch.zeros(shape, dtype=torch.float32, device=env.device)
         return lambda observations: zeros
-    return lambda observations: 2.0 * torch.rand(shape, device=env.device) - 1.0
+    return lambda observations: (
+        2.0 * torch.rand(shape, dtype=torch.float32, device=env.device) - 1.0
+    )
 
 
 def make_env(

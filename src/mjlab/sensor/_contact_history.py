@@ -20,7 +20,7 @@ class ContactHistory:
     def __init__(self, length: int, num_envs: int, width: int, device: str) -> None:
         """Make room for `length` blocks of shape (num_envs, width)."""
         # `_head` is the newest block; older ones follow it cyclically.
-        self._ring = torch.zeros(length, num_envs, width, device=device)
+        self._ring = torch.zeros(length, num_envs, width, dtype=torch.float32, device=device)
         self._head = 0
         self._slots = list(self._ring.unbind())
         slots = torch.arange(length, device=device)

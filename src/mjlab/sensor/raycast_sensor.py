@@ -151,15 +151,15 @@ class RayCastSensor(Sensor[RayCastData]):
         self._num_rays_per_frame = len(offsets)
         self._moving_directions = not is_constant(directions, self.cfg.ray_alignment)
         shape = (data.qpos.shape[0], self.num_frames)
-        self._frame_pos = torch.zeros(*shape, 3, device=device)
-        self._frame_mat = torch.eye(3, device=device).repeat(*shape, 1, 1)
+        self._frame_pos = torch.zeros(*shape, 3, dtype=torch.float32, device=device)
+        self._frame_mat = torch.eye(3, dtype=torch.float32, device=device).repeat(*shape, 1, 1)
         self.set_buffers(
-            torch.zeros(shape[0], self.num_rays, 3, device=device),
-            torch.zeros(shape[0], self.num_rays, 3, device=device),
+            torch.zeros(shape[0], self.num_rays, 3, dtype=torch.float32, device=device),
+            torch.zeros(shape[0], self.num_rays, 3, dtype=torch.float32, device=device),
         )
         self.set_results(
-            torch.zeros(shape[0], self.num_rays, device=device),
-            torch.zeros(shape[0], self.num_rays, 3, device=device),
+            torch.zeros(shape[0], self.num_rays, dtype=torch.float32, device=device),
+            torch.zeros(shape[0], self.num_rays, 3, dtype=torch.float32, device=device),
         )
 
     def set_buffers(self, origins: torch.Tensor, directions: torch.Tensor) -> None:
@@ -228,7 +228,12 @@ class RayCastSensor(Sensor[RayCastData]):
 
     def raycast_kernel(self, rc: Callable[..., tuple[torch.Tensor, ...]]) -> None:
         """Cast the prepared rays of this sensor alone, by `rc`: `Simulation.raycast`."""
-        reach = torch.full((self.num_rays,), self.cfg.max_distance, device=self._origins.device)
+        reach = torch.full(
+            (self.num_rays,),
+            self.cfg.max_distance,
+            dtype=torch.float32,
+            device=self._origins.device,
+        )
         excluded = torch.tensor(
             self.excluded_bodies, dtype=torch.int32, device=self._origins.device
         )

@@ -171,14 +171,14 @@ class _RayQuery:
         self._sensors = sensors
         ends = torch.tensor([sensor.num_rays for sensor in sensors]).cumsum(0).tolist()
         self._parts = [slice(a, b) for a, b in zip([0, *ends], ends, strict=False)]
-        self._origins = torch.zeros(num_envs, ends[-1], 3, device=device)
-        self._directions = torch.zeros(num_envs, ends[-1], 3, device=device)
+        self._origins = torch.zeros(num_envs, ends[-1], 3, dtype=torch.float32, device=device)
+        self._directions = torch.zeros(num_envs, ends[-1], 3, dtype=torch.float32, device=device)
         for sensor, part in zip(sensors, self._parts, strict=True):
             sensor.set_buffers(self._origins[:, part], self._directions[:, part])
         excluded = [body for sensor in sensors for body in sensor.excluded_bodies]
         self._excluded = torch.tensor(excluded, dtype=torch.int32, device=device)
         reach = [sensor.cfg.max_distance for sensor in sensors for _ in range(sensor.num_rays)]
-        self._reach = torch.tensor(reach, device=device)
+        self._reach = torch.tensor(reach, dtype=torch.float32, device=device)
 
     def cast(self, raycast: RayCast) -> None:
         distances, normals, _ = raycast(

@@ -19,7 +19,7 @@ def grid_origins(num_envs: int, spacing: float, device: str) -> torch.Tensor:
     num_cols = math.ceil(num_envs / num_rows)
     index = torch.arange(num_envs, device=device)
     row = torch.div(index, num_cols, rounding_mode="floor")
-    origins = torch.zeros(num_envs, 3, device=device)
+    origins = torch.zeros(num_envs, 3, dtype=torch.float32, device=device)
     origins[:, 0] = -(row - (num_rows - 1) / 2) * spacing
     origins[:, 1] = (index % num_cols - (num_cols - 1) / 2) * spacing
     return origins

@@ -94,7 +94,7 @@ class TerrainEntity(Entity):
             ValueError: the config makes no sense, or asks for what is not available.
         """
         self._device = device
-        self.env_origins = torch.zeros(cfg.num_envs, 3, device=device)
+        self.env_origins = torch.zeros(cfg.num_envs, 3, dtype=torch.float32, device=device)
         """(N, 3) world positions of the environments' origins."""
         self.terrain_origins: torch.Tensor | None = None
         """(R, C, 3) spawn points of a grid of R levels and C columns; None on a plane."""

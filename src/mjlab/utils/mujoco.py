@@ -1,7 +1,8 @@
-"""Facts about elements of a MuJoCo spec: widths of joints, kinds of actuators."""
+"""Facts about elements of a MuJoCo spec: widths of joints, kinds and controls of actuators."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Literal
 
 import mujoco
@@ -73,26 +74,76 @@ def is_motor_actuator(actuator: mujoco.MjsActuator) -> bool:
     )
 
 
-def detect_command_field(actuator: mujoco.MjsActuator) -> CommandField:
-    """Return which command the control of `actuator` is: a position, a velocity or an effort.
+# In the order of controls. A feedforward is a force; a voltage is commanded as an effort.
+_INPUTS: tuple[tuple[mujoco.mjtCtrlInput, CommandField], ...] = (
+    (mujoco.mjtCtrlInput.mjINPUT_POS, "position"),
+    (mujoco.mjtCtrlInput.mjINPUT_VEL, "velocity"),
+    (mujoco.mjtCtrlInput.mjINPUT_FF, "effort"),
+    (mujoco.mjtCtrlInput.mjINPUT_VOLTAGE, "effort"),
+)
+# Inputs where the spec states none.
+_DEFAULT_INPUTS = {
+    int(mujoco.mjtGain.mjGAIN_PID): (
+        mujoco.mjtCtrlInput.mjINPUT_POS.value | mujoco.mjtCtrlInput.mjINPUT_VEL.value
+    ),
+    int(mujoco.mjtGain.mjGAIN_DCMOTOR): mujoco.mjtCtrlInput.mjINPUT_VOLTAGE.value,
+}
 
-    Raises `ValueError` for an actuator that is no motor, muscle, position or velocity servo.
+
+def control_inputs(actuator: mujoco.MjsActuator) -> tuple[CommandField | None, ...]:
+    """Return the command that each control of `actuator` is, in the order of its columns of `ctrl`.
+
+    None stands for a control of an unknown kind, or a component of an orientation. `<pid>` and
+    `<dcmotor>` have one control for each of their inputs, `<orientation>` three or four.
     """
-    if is_muscle_actuator(actuator):
-        return "effort"
+    if actuator.gaintype == mujoco.mjtGain.mjGAIN_SO3:
+        is_quaternion = actuator.ctrlspec == mujoco.mjtCtrlChart.mjCHART_QUAT
+        return (None,) * (4 if is_quaternion else 3)
+    default = _DEFAULT_INPUTS.get(int(actuator.gaintype))
+    if default is not None:
+        present = actuator.ctrlspec or default
+        return tuple(command for bit, command in _INPUTS if present & int(bit))
     if is_position_actuator(actuator):
-        return "position"
+        return ("position",)
     if is_velocity_actuator(actuator):
-        return "velocity"
-    if is_motor_actuator(actuator):
-        return "effort"
-    raise ValueError(
-        f"The kind of actuator {actuator.name!r} cannot be detected (dyntype "
-        f"{actuator.dyntype.name}, gaintype {actuator.gaintype.name}, biastype "
-        f"{actuator.biastype.name}, gainprm {list(actuator.gainprm[:3])}, biasprm "
-        f"{list(actuator.biasprm[:3])}). Known are <motor>, <position>, <velocity> and <muscle>; "
-        "for another kind state the command field in the actuator config."
-    )
+        return ("velocity",)
+    if is_muscle_actuator(actuator) or is_motor_actuator(actuator):
+        return ("effort",)
+    return (None,)
+
+
+def detect_command_field(actuator: mujoco.MjsActuator) -> CommandField:
+    """Return the command that the one control of `actuator` is: position, velocity or effort.
+
+    Raises `ValueError` for an actuator of an unknown kind, and one without or with several controls.
+    """
+    inputs = control_inputs(actuator)
+    if len(inputs) != 1:
+        raise ValueError(
+            f"Actuator {actuator.name!r}: expected one control, got {len(inputs)}; use "
+            "control_inputs."
+        )
+    if inputs[0] is None:
+        raise ValueError(
+            f"The kind of actuator {actuator.name!r} cannot be detected (dyntype "
+            f"{actuator.dyntype.name}, gaintype {actuator.gaintype.name}, biastype "
+            f"{actuator.biastype.name}, gainprm {list(actuator.gainprm[:3])}, biasprm "
+            f"{list(actuator.biasprm[:3])}). Known are <motor>, <position>, <velocity>, <muscle>, "
+            "<pid> and <dcmotor>; for another kind state the command field in the actuator config."
+        )
+    return inputs[0]
+
+
+def control_columns(model: mujoco.MjModel, actuator_ids: Iterable[int]) -> list[int]:
+    """Return the columns of `ctrl` of each actuator in turn: none, one or several."""
+    starts, widths = model.actuator_ctrladr, model.actuator_ctrlnum
+    return [int(starts[i]) + k for i in actuator_ids for k in range(widths[i])]
+
+
+def force_columns(model: mujoco.MjModel, actuator_ids: Iterable[int]) -> list[int]:
+    """Return the columns of `actuator_force` of each actuator in turn, one or several."""
+    starts, widths = model.actuator_outadr, model.actuator_outnum
+    return [int(starts[i]) + k for i in actuator_ids for k in range(widths[i])]
 
 
 def _has_affine_bias(actuator: mujoco.MjsActuator) -> bool:

@@ -203,7 +203,8 @@ def _target(spec: mujoco.MjSpec, name: str, transmission_type: Any, allow_site: 
 
 def _add(spec: mujoco.MjSpec, name: str, target: str, transmission_type: Any) -> mujoco.MjsActuator:
     trntype = _TRANSMISSIONS[_value(transmission_type)]
-    return spec.add_actuator(name=name, target=target, trntype=trntype)
+    # Inputs of the spec's default, such as those of a <pid>, are not those of this kind.
+    return spec.add_actuator(name=name, target=target, trntype=trntype, ctrlspec=0)
 
 
 def _set_affine(

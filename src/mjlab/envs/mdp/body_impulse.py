@@ -66,7 +66,7 @@ class apply_body_impulse:
         self._cooldown_s = tuple(params["cooldown_s"])
         self._offset = params.get("body_point_offset")
         self._viz = self._read_viz_cfg(params.get("viz_cfg"))
-        self._remaining = torch.zeros(env.num_envs, device=env.device)
+        self._remaining = torch.zeros(env.num_envs, dtype=torch.float32, device=env.device)
         self._active = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
         self._cooldown = sample_uniform(*self._cooldown_s, (env.num_envs,), env.device)
 
@@ -152,7 +152,9 @@ class apply_body_impulse:
         self._cooldown[ids] = sample_uniform(*self._cooldown_s, (len(ids),), self._env.device)
 
     def _write_zero(self, ids: torch.Tensor) -> None:
-        zero = torch.zeros(len(ids), self._num_bodies, 3, device=self._env.device)
+        zero = torch.zeros(
+            len(ids), self._num_bodies, 3, dtype=torch.float32, device=self._env.device
+        )
         self._write(zero, zero, ids)
 
     def _write(self, force: torch.Tensor, torque: torch.Tensor, ids: torch.Tensor) -> None:

@@ -213,7 +213,9 @@ def _sample_se3_range(
     unknown = [key for key in ranges if key not in _SE3_KEYS]
     if unknown:
         raise ValueError(f"Ranges have unknown keys {unknown}; the keys are {list(_SE3_KEYS)}.")
-    bounds = torch.tensor([ranges.get(key, (0.0, 0.0)) for key in _SE3_KEYS], device=device)
+    bounds = torch.tensor(
+        [ranges.get(key, (0.0, 0.0)) for key in _SE3_KEYS], dtype=torch.float32, device=device
+    )
     return sample_uniform(bounds[:, 0], bounds[:, 1], shape, device)
 
 

@@ -34,7 +34,8 @@ def joint_torques_l2(
 ) -> torch.Tensor:
     """Sum of squared actuator forces, before their gear, over the selected **actuators**."""
     asset: Entity = env.scene[asset_cfg.name]
-    forces = asset.data.actuator_force[:, columns(asset_cfg.actuator_ids, env.device)]
+    chosen = asset.data.indexing.force_columns(asset_cfg.actuator_ids)
+    forces = asset.data.actuator_force[:, columns(chosen, env.device)]
     return forces.square().sum(dim=1)
 
 

@@ -42,10 +42,13 @@ class Mirror:
         self, sources: Sequence[int], signs: Sequence[float], couplings: Sequence[Coupling] = ()
     ) -> None:
         """Take indices and signs, of one length."""
-        self.sources, self.signs = torch.tensor(sources), torch.tensor(signs)
+        self.sources = torch.tensor(sources)
+        self.signs = torch.tensor(signs, dtype=torch.float32)
         self._targets = torch.tensor([coupling.target for coupling in couplings]).long()
         self._read = torch.tensor([coupling.source for coupling in couplings]).long()
-        self._factors = torch.tensor([coupling.factor for coupling in couplings])
+        self._factors = torch.tensor(
+            [coupling.factor for coupling in couplings], dtype=torch.float32
+        )
 
     def __len__(self) -> int:
         return len(self.signs)
@@ -104,10 +107,14 @@ def mirror_of_joints(model: mujoco.MjModel, robot: Any) -> Mirror:
     names = robot.joint_names
     pairs = partners(names)
     axes, places, is_slide = _joint_frames(model, robot)
-    reflect = torch.where(is_slide[:, None], torch.tensor(DIRECTION), torch.tensor(ROTATION))
+    reflect = torch.where(
+        is_slide[:, None],
+        torch.tensor(DIRECTION, dtype=torch.float32),
+        torch.tensor(ROTATION, dtype=torch.float32),
+    )
     signs = ((axes * reflect)[pairs] * axes).sum(dim=1)
     pose = robot.data.default_joint_pos[0].cpu()
-    apart = (places[pairs] * torch.tensor(DIRECTION) - places).norm(dim=1)
+    apart = (places[pairs] * torch.tensor(DIRECTION, dtype=torch.float32) - places).norm(dim=1)
     for i, partner in enumerate(pairs):
         if (
             abs(abs(signs[i]) - 1) > _AXIS_TOLERANCE

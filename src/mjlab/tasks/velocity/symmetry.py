@@ -312,7 +312,7 @@ def _of_actions(env: ManagerBasedRlEnv, params: dict[str, Any] | None = None) ->
     if set(across) != set(driven):
         raise ValueError(f"The actions drive joints of one side only. {WITHOUT}")
     sources = [driven.index(joint) for joint in across]
-    scale = torch.as_tensor(term.scale).expand(env.num_envs, len(driven))
+    scale = torch.as_tensor(term.scale, dtype=torch.float32).expand(env.num_envs, len(driven))
     if not torch.allclose(scale[:, sources], scale):
         raise ValueError(f"The actions have another scale on the left than on the right. {WITHOUT}")
     return Mirror(sources, joints.signs[driven].tolist())
@@ -340,7 +340,9 @@ def _of_rays(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
     cfg: Any = env.scene[params["sensor_name"]].cfg
     frames = cfg.frame if isinstance(cfg.frame, tuple) else (cfg.frame,)
     rays = torch.cat(cfg.pattern.generate_rays(env.sim.mj_model, "cpu"), dim=1)
-    apart = ((rays * torch.tensor(2 * DIRECTION))[:, None] - rays[None]).norm(dim=-1)
+    apart = ((rays * torch.tensor(2 * DIRECTION, dtype=torch.float32))[:, None] - rays[None]).norm(
+        dim=-1
+    )
     data, root = _reference_pose(env)
     frame = frames[0]
     element = getattr(env.sim.mj_model, frame.type)(frame.prefixed_name())

@@ -178,7 +178,10 @@ class DelayBuffer:
 
     def _draw_uniform(self) -> torch.Tensor:
         return torch.rand(
-            self._num_draws, generator=self._generator, device=self._source_device()
+            self._num_draws,
+            dtype=torch.float32,
+            generator=self._generator,
+            device=self._source_device(),
         ).to(self._device)
 
     def _source_device(self) -> torch.device | str:

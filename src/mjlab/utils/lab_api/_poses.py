@@ -130,12 +130,12 @@ def interpolate_poses(
 
 def generate_random_rotation(rot_boundary: float = 2 * math.pi) -> torch.Tensor:
     """Return a rotation matrix (3, 3) from Euler angles uniform in [0, rot_boundary)."""
-    return matrix_from_euler(torch.rand(3) * rot_boundary, "XYZ")
+    return matrix_from_euler(torch.rand(3, dtype=torch.float32) * rot_boundary, "XYZ")
 
 
 def generate_random_translation(pos_boundary: float = 1) -> torch.Tensor:
     """Return a translation (3,), uniform in [-pos_boundary, pos_boundary)."""
-    return (torch.rand(3) * 2.0 - 1.0) * pos_boundary
+    return (torch.rand(3, dtype=torch.float32) * 2.0 - 1.0) * pos_boundary
 
 
 def generate_random_transformation_matrix(

@@ -14,7 +14,7 @@ def sample_uniform(
     lower: torch.Tensor | float, upper: torch.Tensor | float, size: Size, device: str
 ) -> torch.Tensor:
     """Return numbers uniform in [lower, upper). The bounds may be tensors that broadcast."""
-    return torch.rand(_shape(size), device=device) * (upper - lower) + lower
+    return torch.rand(_shape(size), dtype=torch.float32, device=device) * (upper - lower) + lower
 
 
 def sample_log_uniform(
@@ -34,13 +34,16 @@ def sample_gaussian(
     Where `mean` is a tensor, its shape is that of the result and `size` is not used.
     """
     shape = mean.shape if isinstance(mean, torch.Tensor) else _shape(size)
-    return torch.randn(shape, device=device) * std + mean
+    return torch.randn(shape, dtype=torch.float32, device=device) * std + mean
 
 
 def sample_triangle(lower: float, upper: float, size: Size, device: str) -> torch.Tensor:
     """Return numbers of the triangular distribution on [lower, upper], densest in the middle."""
     # The mean of two uniform numbers has this distribution.
-    mean = 0.5 * (torch.rand(_shape(size), device=device) + torch.rand(_shape(size), device=device))
+    mean = 0.5 * (
+        torch.rand(_shape(size), dtype=torch.float32, device=device)
+        + torch.rand(_shape(size), dtype=torch.float32, device=device)
+    )
     return mean * (upper - lower) + lower
 
 
@@ -55,7 +58,7 @@ def sample_cylinder(
 
 def default_orientation(num: int, device: str) -> torch.Tensor:
     """Return identity quaternions (num, 4)."""
-    quat = torch.zeros(num, 4, device=device)
+    quat = torch.zeros(num, 4, dtype=torch.float32, device=device)
     quat[:, 0] = 1.0
     return quat
 
@@ -63,12 +66,12 @@ def default_orientation(num: int, device: str) -> torch.Tensor:
 def random_orientation(num: int, device: str) -> torch.Tensor:
     """Return quaternions (num, 4) uniform over all orientations."""
     # The direction of a normally distributed vector is uniform on the sphere.
-    return normalize(torch.randn(num, 4, device=device))
+    return normalize(torch.randn(num, 4, dtype=torch.float32, device=device))
 
 
 def random_yaw_orientation(num: int, device: str) -> torch.Tensor:
     """Return quaternions (num, 4) of rotations about z, uniform in angle."""
-    zero = torch.zeros(num, device=device)
+    zero = torch.zeros(num, dtype=torch.float32, device=device)
     return quat_from_euler_xyz(zero, zero, sample_uniform(0.0, 2.0 * torch.pi, num, device))
 
 

@@ -53,7 +53,7 @@ class NoiseModelWithAdditiveBias(NoiseModel):
             )
         self._bias_noise_cfg = noise_model_cfg.bias_noise_cfg
         # One bias an environment; one a component once the first data shows how many there are.
-        self._bias = torch.zeros(num_envs, 1, device=device)
+        self._bias = torch.zeros(num_envs, 1, dtype=torch.float32, device=device)
         self._waits_for_components = noise_model_cfg.sample_bias_per_component
 
     def __call__(self, data: torch.Tensor) -> torch.Tensor:

@@ -64,7 +64,9 @@ class BaseAction(ActionTerm):
         self._target_ids = torch.tensor(ids, dtype=torch.long, device=self.device)
         # The same targets as a slice where they are contiguous, which reads without a copy.
         self._columns = columns(ids, self.device)
-        self._raw_actions = torch.zeros(self.num_envs, len(ids), device=self.device)
+        self._raw_actions = torch.zeros(
+            self.num_envs, len(ids), dtype=torch.float32, device=self.device
+        )
         self._processed_actions = torch.zeros_like(self._raw_actions)
         self._scale = self._by_target("scale", cfg.scale, 1.0)
         self._offset = self._by_target("offset", cfg.offset, 0.0)
@@ -135,7 +137,9 @@ class BaseAction(ActionTerm):
                 f"{type(self.cfg).__name__}.{what} must be a number or a dict of name pattern to "
                 f"number, got {type(value).__name__}: {value!r}."
             )
-        per_target = torch.full((self.action_dim,), default, device=self.device)
+        per_target = torch.full(
+            (self.action_dim,), default, dtype=torch.float32, device=self.device
+        )
         ids, _, values = resolve_matching_names_values(value, self._target_names)
         per_target[ids] = torch.tensor(values, dtype=torch.float, device=self.device)
         return per_target.repeat(self.num_envs, 1)
@@ -149,11 +153,11 @@ class BaseAction(ActionTerm):
                 f"{type(self.cfg).__name__}.clip must be a dict of name pattern to (low, high), "
                 f"got {type(self.cfg.clip).__name__}: {self.cfg.clip!r}."
             )
-        bounds = torch.tensor([-torch.inf, torch.inf], device=self.device)
+        bounds = torch.tensor([-torch.inf, torch.inf], dtype=torch.float32, device=self.device)
         bounds = bounds.repeat(self.action_dim, 1)
         ids, names, values = resolve_matching_names_values(self.cfg.clip, self._target_names)
         for i, name, pair in zip(ids, names, values, strict=True):
-            bounds[i] = torch.tensor(_bounds(name, pair), device=self.device)
+            bounds[i] = torch.tensor(_bounds(name, pair), dtype=torch.float32, device=self.device)
         return bounds.repeat(self.num_envs, 1, 1)
 
 

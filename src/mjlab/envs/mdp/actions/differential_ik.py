@@ -132,11 +132,15 @@ class DifferentialIKAction(ActionTerm):
         self._dofs = columns(dofs, self.device)
         self._find_frame()
         self._posture = self._find_posture()
-        self._raw_actions = torch.zeros(self.num_envs, self.action_dim, device=self.device)
+        self._raw_actions = torch.zeros(
+            self.num_envs, self.action_dim, dtype=torch.float32, device=self.device
+        )
         scales = (cfg.delta_pos_scale,) * 3 + (cfg.delta_ori_scale,) * 3
-        self._scale = torch.tensor(scales[: self.action_dim], device=self.device)
-        self._desired_pos = torch.zeros(self.num_envs, 3, device=self.device)
-        self._desired_quat = torch.zeros(self.num_envs, 4, device=self.device)
+        self._scale = torch.tensor(
+            scales[: self.action_dim], dtype=torch.float32, device=self.device
+        )
+        self._desired_pos = torch.zeros(self.num_envs, 3, dtype=torch.float32, device=self.device)
+        self._desired_quat = torch.zeros(self.num_envs, 4, dtype=torch.float32, device=self.device)
         self.reset()
 
     @property

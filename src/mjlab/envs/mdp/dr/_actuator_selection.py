@@ -48,9 +48,9 @@ def selected_actuators(
     `asset_cfg.actuator_ids` counts single actuators, as `actuator_names` does.
     """
     entity: Entity = env.scene[asset_cfg.name]
-    chosen = entity.data.indexing.ctrl_ids[columns(asset_cfg.actuator_ids, env.device)]
+    chosen = entity.data.indexing.actuator_ids[columns(asset_cfg.actuator_ids, env.device)]
     for actuator in entity.actuators:
-        ids, count = actuator.global_ctrl_ids, len(actuator.target_names)
+        ids, count = actuator.global_element_ids, len(actuator.target_names)
         # Kinds of a user's own may have another layout; who needs single elements refuses them.
         elements = ids.reshape(-1, count) if len(ids) % count == 0 else ids[None, :]
         is_chosen = torch.isin(elements, chosen.to(elements.dtype)).any(dim=0)

@@ -22,6 +22,7 @@ from mjlab.envs.mdp.dr._selection import (
 )
 from mjlab.managers.event_manager import RecomputeLevel
 
+# Spatial tendons run through sites and around geoms, and actuators act at sites.
 _AT_QPOS0 = RecomputeLevel.set_const_0
 _ALL = RecomputeLevel.set_const
 
@@ -71,7 +72,11 @@ _GEOMS = (
         default_axes=(0,),
     ),
     FieldRow(
-        "geom_pos", "geom_pos", GEOM, "Randomize geom positions x, y, z (m) in the body frame."
+        "geom_pos",
+        "geom_pos",
+        GEOM,
+        "Randomize geom positions x, y, z (m) in the body frame.",
+        recompute=_AT_QPOS0,
     ),
     FieldRow(
         "geom_quat",
@@ -79,6 +84,7 @@ _GEOMS = (
         GEOM,
         "Perturb geom orientations in the body frame.",
         rotation=True,
+        recompute=_AT_QPOS0,
     ),
     FieldRow(
         "geom_rgba",
@@ -94,6 +100,7 @@ _GEOMS = (
         "inertia stay. Planes, height fields, meshes and SDFs are refused.",
         operation="scale",
         also_writes=("geom_rbound", "geom_aabb"),
+        recompute=_AT_QPOS0,
         before=hooks.require_primitive_geoms,
         after=hooks.refresh_geom_bounds,
     ),
@@ -138,7 +145,11 @@ _JOINTS = (
 
 _SITES = (
     FieldRow(
-        "site_pos", "site_pos", SITE, "Randomize site positions x, y, z (m) in the body frame."
+        "site_pos",
+        "site_pos",
+        SITE,
+        "Randomize site positions x, y, z (m) in the body frame.",
+        recompute=_AT_QPOS0,
     ),
     FieldRow(
         "site_quat",
@@ -146,6 +157,7 @@ _SITES = (
         SITE,
         "Perturb site orientations in the body frame.",
         rotation=True,
+        recompute=_AT_QPOS0,
     ),
 )
 

@@ -51,14 +51,14 @@ class Operation:
 def _uniform(
     lower: torch.Tensor, upper: torch.Tensor, shape: tuple[int, ...], device: str
 ) -> torch.Tensor:
-    return torch.rand(shape, device=device) * (upper - lower) + lower
+    return torch.rand(shape, dtype=torch.float32, device=device) * (upper - lower) + lower
 
 
 def _log_uniform(
     lower: torch.Tensor, upper: torch.Tensor, shape: tuple[int, ...], device: str
 ) -> torch.Tensor:
     low, high = torch.log(lower), torch.log(upper)
-    drawn = torch.exp(torch.rand(shape, device=device) * (high - low) + low)
+    drawn = torch.exp(torch.rand(shape, dtype=torch.float32, device=device) * (high - low) + low)
     # Equal bounds are a constant, also at or below zero, where the logarithm does not exist.
     return torch.where(lower == upper, lower.expand(shape), drawn)
 
@@ -66,7 +66,7 @@ def _log_uniform(
 def _gaussian(
     lower: torch.Tensor, upper: torch.Tensor, shape: tuple[int, ...], device: str
 ) -> torch.Tensor:
-    return torch.randn(shape, device=device) * upper + lower
+    return torch.randn(shape, dtype=torch.float32, device=device) * upper + lower
 
 
 def _check_log_bounds(lower: float, upper: float) -> None:

@@ -73,6 +73,10 @@ _SERVO_GAINS = Gains(
 _VELOCITY_GAINS = Gains(
     kp=(), kd=(Place("actuator_gainprm", 0, 1.0), Place("actuator_biasprm", 2, -1.0))
 )
+# A `<pid>` has its integral gain where a servo has the gain of its control.
+_PID_GAINS = Gains(
+    kp=(Place("actuator_biasprm", 1, -1.0),), kd=(Place("actuator_biasprm", 2, -1.0),)
+)
 # Two MuJoCo actuators a target: the first follows the position, the second the velocity.
 _PD_GAINS = Gains(
     kp=(Place("actuator_gainprm", 0, 1.0, 0), Place("actuator_biasprm", 1, -1.0, 0)),
@@ -125,7 +129,7 @@ def pd_gains(
     dist, op = resolve_distribution(distribution), _scale_or_abs(operation, "pd_gains")
     bounds = read_bounds(kp_range, "kp_range"), read_bounds(kd_range, "kd_range")
     chosen = list(selected_actuators(env, resolve_env_ids(env, env_ids), asset_cfg))
-    places = [_gain_places(selected.actuator) for selected in chosen]
+    places = [_gain_places(env, selected) for selected in chosen]
     for selected, gains in zip(chosen, places, strict=True):
         kp, kd = (selected.draw(dist, pair, env.device) for pair in bounds)
         if isinstance(selected.actuator, IdealPdActuator):
@@ -178,16 +182,19 @@ def effort_limits(
         if isinstance(selected.actuator, IdealPdActuator):
             _set_ideal_limits(selected, op, samples)
         for place in targets:
-            values = samples
-            if op is ABS and place.field == "actuator_ctrlrange":
-                # Efforts are controls times the gain, which only motors of the XML have.
-                gains = _default(env, selected.rows, columns, "actuator_gainprm", 0)
-                values = samples / gains.abs()
-            _write(env, selected.rows, columns, place, op, values)
+            values, at = samples, columns
+            if place.field == "actuator_ctrlrange":
+                at = env.sim.get_default_field("actuator_ctrladr")[columns]
+                if op is ABS:
+                    # Efforts are controls times the gain, which only motors of the XML have.
+                    gains = _default(env, selected.rows, columns, "actuator_gainprm", 0)
+                    values = samples / gains.abs()
+            _write(env, selected.rows, at, place, op, values)
 
 
-def _gain_places(actuator: Actuator) -> Gains:
+def _gain_places(env: ManagerBasedRlEnv, selected: SelectedActuator) -> Gains:
     """Return where an actuator's gains are in the model; nowhere if they are not there as such."""
+    actuator = selected.actuator
     if isinstance(actuator, IdealPdActuator):
         return Gains((), ())
     if isinstance(actuator, BuiltinPdActuator):
@@ -205,15 +212,23 @@ def _gain_places(actuator: Actuator) -> Gains:
                 "set slew_rate to 0."
             )
         return Gains((), ())
+    if isinstance(actuator, XmlActuator):
+        kinds = env.sim.mj_model.actuator_gaintype[selected.elements[0].tolist()]
+        if (kinds == mujoco.mjtGain.mjGAIN_PID).all():
+            return _PID_GAINS
+        if (kinds != mujoco.mjtGain.mjGAIN_FIXED).any():
+            raise TypeError(_refusal("pd_gains", actuator, _WITH_GAINS))
     if _reads(actuator, "position", BuiltinPositionActuator):
         return _SERVO_GAINS
     if _reads(actuator, "velocity", BuiltinVelocityActuator):
         return _VELOCITY_GAINS
-    supported = (
-        "position and velocity servos (builtin or XML), BuiltinPdActuator, BuiltinDcMotorActuator, "
-        "IdealPdActuator and its subclasses"
-    )
-    raise TypeError(_refusal("pd_gains", actuator, supported))
+    raise TypeError(_refusal("pd_gains", actuator, _WITH_GAINS))
+
+
+_WITH_GAINS = (
+    "position and velocity servos (builtin or XML), <pid> of the XML, BuiltinPdActuator, "
+    "BuiltinDcMotorActuator, IdealPdActuator and its subclasses"
+)
 
 
 def _limit_places(
@@ -229,7 +244,7 @@ def _limit_places(
         if actuator.transmission_type == TransmissionType.JOINT:
             return indexing.joint_ids[targets].long(), _range_of("jnt_actfrcrange")
         return indexing.tendon_ids[targets].long(), _range_of("tendon_actfrcrange")
-    if isinstance(actuator, XmlActuator) and actuator.command_field == "effort":
+    if isinstance(actuator, XmlActuator) and actuator.command_fields == ("effort",):
         return elements, _xml_effort_places(env, selected)
     if isinstance(actuator, _FORCE_LIMITED):
         return elements, _FORCE_RANGE
@@ -266,7 +281,10 @@ def _xml_effort_places(env: ManagerBasedRlEnv, selected: SelectedActuator) -> tu
     idle = [
         selected.actuator.target_names[target]
         for i, target in zip(ids, selected.targets.tolist(), strict=True)
-        if not (model.actuator_forcelimited[i] or (by_control and model.actuator_ctrllimited[i]))
+        if not (
+            model.actuator_forcelimited[i]
+            or (by_control and model.actuator_ctrllimited[model.actuator_ctrladr[i]])
+        )
     ]
     if idle:
         raise TypeError(
@@ -290,14 +308,14 @@ def _is_motor(model: mujoco.MjModel, i: int) -> bool:
 def _reads(actuator: Actuator, command: CommandField, builtin: type[Actuator]) -> bool:
     """Return whether it is a MuJoCo servo for this command, builtin or of the XML."""
     if isinstance(actuator, XmlActuator):
-        return actuator.command_field == command
+        return actuator.command_fields == (command,)
     return isinstance(actuator, builtin)
 
 
 def _refusal(function: str, actuator: Actuator, supported: str) -> str:
     kind = type(actuator).__name__
     if isinstance(actuator, XmlActuator):
-        kind += f" with command field {actuator.command_field!r}"
+        kind += f" with command field {', '.join(actuator.command_fields)!r}"
     return (
         f"{function}: the actuators {list(actuator.target_names)} are of kind {kind}, which it "
         f"cannot randomize. Supported: {supported}. Select others by name."

@@ -160,7 +160,7 @@ def inertial_from_pseudo_inertia(matrix: torch.Tensor) -> Inertial:
     about_origin = _trace_identity(sigma) - sigma
     about_com = about_origin - mass[..., None, None] * _steiner(com)
     inertia, axes = torch.linalg.eigh(0.5 * (about_com + about_com.transpose(-1, -2)))
-    sign = torch.where(torch.linalg.det(axes) < 0.0, -1.0, 1.0)
+    sign = torch.where(torch.linalg.det(axes) < 0.0, -1.0, 1.0).to(axes.dtype)
     # Eigenvectors have no sign: turning the third makes them a rotation where they are none.
     axes = torch.cat((axes[..., :2], axes[..., 2:] * sign[..., None, None]), dim=-1)
     return Inertial(mass, com, inertia, quat_from_matrix(axes))

@@ -78,11 +78,11 @@ class GoalCommand(CommandTerm):
 
     def __init__(self, cfg: GoalCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
-        self.target_pos = torch.zeros(self.num_envs, 3, device=self.device)
-        self.goal_age = torch.zeros(self.num_envs, device=self.device)
+        self.target_pos = torch.zeros(self.num_envs, 3, dtype=torch.float32, device=self.device)
+        self.goal_age = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self.last_goal_met = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.metrics = {
-            name: torch.zeros(self.num_envs, device=self.device)
+            name: torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
             for name in ("position_error", "at_goal", "goal_success", "episode_success")
         }
         self._moved: torch.Tensor | None = None
@@ -173,7 +173,9 @@ class GoalCommand(CommandTerm):
 
     def _draw_goals(self, count: int) -> torch.Tensor:
         if self.cfg.difficulty == "fixed":
-            return torch.tensor(FIXED_GOAL, device=self.device).expand(count, 3)
+            return torch.tensor(FIXED_GOAL, dtype=torch.float32, device=self.device).expand(
+                count, 3
+            )
         within = self.cfg.target_position_range
         return uniform_in(count, within.x, within.y, within.z, device=self.device)
 
@@ -216,7 +218,7 @@ class GoalCommand(CommandTerm):
 
 def uniform_in(count: int, *ranges: tuple[float, float], device: str) -> torch.Tensor:
     """Return `count` rows of numbers, the i-th of each uniform within the i-th range."""
-    drawn = torch.rand(count, len(ranges), device=device)
+    drawn = torch.rand(count, len(ranges), dtype=torch.float32, device=device)
     for column, (low, high) in zip(drawn.unbind(dim=1), ranges, strict=True):
         column.mul_(high - low).add_(low)
     return drawn

@@ -77,7 +77,7 @@ class LiftingCommand(GoalCommand):
         if cfg.object_pose_range is not None:
             check_pose_range(cfg.object_pose_range)
         self.metrics = {
-            "object_height": torch.zeros(self.num_envs, device=self.device),
+            "object_height": torch.zeros(self.num_envs, dtype=torch.float32, device=self.device),
             **self.metrics,
         }
 

@@ -44,7 +44,7 @@ def keep_apart(
             rows = close.nonzero().flatten()
             if len(rows) == 0:
                 break
-            drawn = torch.rand(len(rows), 2, device=positions.device)
+            drawn = torch.rand(len(rows), 2, dtype=torch.float32, device=positions.device)
             positions[rows, index, 0] = drawn[:, 0] * (x[1] - x[0]) + x[0]
             positions[rows, index, 1] = drawn[:, 1] * (y[1] - y[0]) + y[0]
             close[rows] = _too_close(positions[rows], index, apart[rows])

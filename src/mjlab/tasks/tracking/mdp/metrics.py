@@ -40,7 +40,9 @@ def compute_ee_position_error(
     No bodies have no error. Raises `ValueError` for a body that is not tracked.
     """
     if not ee_body_names:
-        return torch.zeros(len(command.robot_joint_vel), device=command.body_indexes.device)
+        return torch.zeros(
+            len(command.robot_joint_vel), dtype=torch.float32, device=command.body_indexes.device
+        )
     columns = body_columns(command, ee_body_names)
     distance = _distance(command.body_pos_relative_w, command.robot_body_pos_w)
     return distance[:, columns].mean(dim=1)
@@ -54,7 +56,9 @@ def compute_ee_orientation_error(
     No bodies have no error. Raises `ValueError` for a body that is not tracked.
     """
     if not ee_body_names:
-        return torch.zeros(len(command.robot_joint_vel), device=command.body_indexes.device)
+        return torch.zeros(
+            len(command.robot_joint_vel), dtype=torch.float32, device=command.body_indexes.device
+        )
     columns = body_columns(command, ee_body_names)
     angle = quat_error_magnitude(command.body_quat_relative_w, command.robot_body_quat_w)
     return angle[:, columns].mean(dim=1)

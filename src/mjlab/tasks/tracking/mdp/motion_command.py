@@ -132,11 +132,11 @@ class MotionCommand(MotionReader, CommandTerm):
         self.time_steps = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self.motion_ids = torch.zeros_like(self.time_steps)
         shape = (self.num_envs, len(indexes))
-        self.body_pos_relative_w = torch.zeros(*shape, 3, device=self.device)
-        self.body_quat_relative_w = torch.zeros(*shape, 4, device=self.device)
+        self.body_pos_relative_w = torch.zeros(*shape, 3, dtype=torch.float32, device=self.device)
+        self.body_quat_relative_w = torch.zeros(*shape, 4, dtype=torch.float32, device=self.device)
         self.body_quat_relative_w[..., 0] = 1.0
         self.metrics = {
-            name: torch.zeros(self.num_envs, device=self.device)
+            name: torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
             for name in (*tracking_metrics(self), *_SAMPLING_METRICS)
         }
         sampler = self._make_sampler()
@@ -152,7 +152,9 @@ class MotionCommand(MotionReader, CommandTerm):
         # Frames are of motions with these lengths: by their shapes, the state of a run on other
         # motions is refused, whose frames may not exist here.
         lengths = self.motion.lengths.tolist()
-        self._extent = [torch.empty(count, 0) for count in (len(lengths), *lengths)]
+        self._extent = [
+            torch.empty(count, 0, dtype=torch.float32) for count in (len(lengths), *lengths)
+        ]
         self.drawing = MotionDrawing(self)
         self._panel: MotionPanel | None = None
 
@@ -192,7 +194,7 @@ class MotionCommand(MotionReader, CommandTerm):
     def bin_failed_count(self) -> torch.Tensor:
         """Running mean of the failures in each bin, (bin_count,). Zeros unless sampling is adaptive."""
         if self.sampler is None:
-            return torch.zeros(self._num_bins, device=self.device)
+            return torch.zeros(self._num_bins, dtype=torch.float32, device=self.device)
         return self.sampler.failed
 
     @property

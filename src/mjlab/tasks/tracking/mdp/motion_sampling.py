@@ -86,7 +86,7 @@ class HardSegmentSampler:
         self._ahead = torch.minimum(bin_ids[:, None] + offsets, last[:, None])
         kernel = decay ** offsets.float()
         self._kernel = kernel / kernel.sum()
-        self.failed = torch.zeros(self.num_bins, device=device)
+        self.failed = torch.zeros(self.num_bins, dtype=torch.float32, device=device)
         self.current_failed = torch.zeros_like(self.failed)
 
     def probabilities(self) -> torch.Tensor:
@@ -98,7 +98,7 @@ class HardSegmentSampler:
     def draw(self, motion: MotionLibrary, count: int, probabilities: torch.Tensor) -> Drawn:
         """Draw a bin by its probability, and a frame uniformly within it."""
         bins = torch.multinomial(probabilities, count, replacement=True)
-        within = torch.rand(count, device=bins.device)
+        within = torch.rand(count, dtype=torch.float32, device=bins.device)
         motions = self._bin_motions[bins]
         place = (bins - self._first_bins[motions] + within) / self._motion_bins[motions]
         last = motion.lengths[motions] - 1

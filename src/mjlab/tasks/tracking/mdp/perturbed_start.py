@@ -55,5 +55,7 @@ def perturbed_start(
 
 
 def _drawn(ranges: Mapping[str, tuple[float, float]], count: int, device: str) -> torch.Tensor:
-    bounds = torch.tensor([ranges.get(axis, (0.0, 0.0)) for axis in AXES], device=device)
+    bounds = torch.tensor(
+        [ranges.get(axis, (0.0, 0.0)) for axis in AXES], dtype=torch.float32, device=device
+    )
     return sample_uniform(bounds[:, 0], bounds[:, 1], (count, len(AXES)), device)

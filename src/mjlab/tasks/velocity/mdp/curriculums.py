@@ -170,7 +170,7 @@ def commands_vel(
                 if bounds is not None:
                     setattr(ranges, name, tuple(bounds))
     return {
-        f"{name}_{end}": torch.tensor(float(bound))
+        f"{name}_{end}": torch.tensor(float(bound), dtype=torch.float32)
         for name in RANGES
         for end, bound in zip(("min", "max"), getattr(ranges, name), strict=True)
     }

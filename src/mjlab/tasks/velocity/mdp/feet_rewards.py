@@ -160,7 +160,9 @@ class feet_swing_height:
         feet = contact_columns(env, contact)
         contacts = f"The contact sensor {contact!r}", feet
         self._check_feet(env, contacts, self._height_columns(env, params))
-        self.peak_heights = torch.zeros(env.num_envs, len(feet), device=env.device)
+        self.peak_heights = torch.zeros(
+            env.num_envs, len(feet), dtype=torch.float32, device=env.device
+        )
 
     def __call__(
         self,

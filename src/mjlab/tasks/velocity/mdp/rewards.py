@@ -123,7 +123,7 @@ class upright:
         self._body = single_body(env, self._asset_cfg)
         for name in cfg.params.get("terrain_sensor_names") or ():
             require_sensor(env, name, RayCastSensor)
-        self._up = torch.tensor([[0.0, 0.0, 1.0]], device=env.device)
+        self._up = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float32, device=env.device)
         # What the last reward was compared with, for drawing.
         self._normal = self._up.repeat(env.num_envs, 1)
 
@@ -261,7 +261,9 @@ class variable_posture:
         # The names are in the order of the joint ids, whichever order the config asks for.
         joints = list(asset_cfg.joint_names)
         tables = [f"std_{gait}" for gait in ("standing", "walking", "running")]
-        stds = torch.tensor([_std_of(joints, name, params[name]) for name in tables])
+        stds = torch.tensor(
+            [_std_of(joints, name, params[name]) for name in tables], dtype=torch.float32
+        )
         # (3, joints): what squared errors are weighted with, which makes their sum a mean.
         self._weights = (1.0 / (stds.square() * len(joints))).to(env.device)
 

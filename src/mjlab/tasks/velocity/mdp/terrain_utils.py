@@ -87,7 +87,7 @@ def terrain_normal_from_sensors(
 def _spread(count: int, max_points: int, device: str) -> torch.Tensor | slice:
     if count <= max_points:
         return slice(None)
-    return torch.linspace(0, count - 1, max_points).long().to(device)
+    return torch.linspace(0, count - 1, max_points, dtype=torch.float32).long().to(device)
 
 
 def _eigenvalues(matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

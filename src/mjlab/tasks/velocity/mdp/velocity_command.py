@@ -129,19 +129,19 @@ class UniformVelocityCommand(CommandTerm):
                 f"init_velocity_prob is {cfg.init_velocity_prob}, but entity {cfg.entity_name!r} "
                 "has a fixed base, which cannot start moving. Set it to 0."
             )
-        self.vel_command_b = torch.zeros(self.num_envs, 3, device=self.device)
+        self.vel_command_b = torch.zeros(self.num_envs, 3, dtype=torch.float32, device=self.device)
         self.vel_command_w = torch.zeros_like(self.vel_command_b)
-        self.heading_target = torch.zeros(self.num_envs, device=self.device)
+        self.heading_target = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self.heading_error = torch.zeros_like(self.heading_target)
         self.is_heading_env = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.is_standing_env = torch.zeros_like(self.is_heading_env)
         self.is_world_env = torch.zeros_like(self.is_heading_env)
         self.is_forward_env = torch.zeros_like(self.is_heading_env)
         self.metrics = {
-            "error_vel_xy": torch.zeros(self.num_envs, device=self.device),
-            "error_vel_yaw": torch.zeros(self.num_envs, device=self.device),
+            "error_vel_xy": torch.zeros(self.num_envs, dtype=torch.float32, device=self.device),
+            "error_vel_yaw": torch.zeros(self.num_envs, dtype=torch.float32, device=self.device),
         }
-        self._samples = torch.zeros(self.num_envs, device=self.device)
+        self._samples = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._joystick: VelocityJoystick | None = None
 
     @property
@@ -195,7 +195,10 @@ class UniformVelocityCommand(CommandTerm):
         log = super().reset(ids)
         self._samples[ids] = 0.0
         if self.cfg.init_velocity_prob > 0.0:
-            is_moving = torch.rand(len(ids), device=self.device) < self.cfg.init_velocity_prob
+            is_moving = (
+                torch.rand(len(ids), dtype=torch.float32, device=self.device)
+                < self.cfg.init_velocity_prob
+            )
             self._start_moving(ids[is_moving])
         return log
 
@@ -215,7 +218,14 @@ class UniformVelocityCommand(CommandTerm):
     def _resample_command(self, env_ids: torch.Tensor) -> None:
         cfg = self.cfg
         # One draw for all numbers, a row each, in the order in which rows are taken.
-        rows = iter(torch.rand(8 if cfg.heading_command else 6, len(env_ids), device=self.device))
+        rows = iter(
+            torch.rand(
+                8 if cfg.heading_command else 6,
+                len(env_ids),
+                dtype=torch.float32,
+                device=self.device,
+            )
+        )
         ranges = [getattr(cfg.ranges, name) for name in RANGES]
         command = torch.stack([_scaled(next(rows), bounds) for bounds in ranges], dim=1)
         if cfg.heading_command:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+from dataclasses import dataclass
 from typing import Literal
 
 import mujoco
@@ -57,6 +58,16 @@ def get_cube_spec(
         rgba=rgba,
     )
     return spec
+
+
+@dataclass(frozen=True)
+class _ColoredCube:
+    """A `spec_fn` that can be pickled and compared, as configs are."""
+
+    rgba: tuple[float, float, float, float]
+
+    def __call__(self) -> mujoco.MjSpec:
+        return get_cube_spec(rgba=self.rgba)
 
 
 def yam_lift_cube_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
@@ -136,7 +147,7 @@ def yam_multi_cube_seg_env_cfg(num_cubes: int = 3, play: bool = False) -> Manage
     cubes = tuple(f"cube_{index}" for index in range(num_cubes))
     for index, name in enumerate(cubes):
         color = (*colorsys.hsv_to_rgb(index / num_cubes, 0.8, 0.9), 1.0)
-        cfg.scene.entities[name] = EntityCfg(spec_fn=lambda rgba=color: get_cube_spec(rgba=rgba))
+        cfg.scene.entities[name] = EntityCfg(spec_fn=_ColoredCube(color))
     cfg.sim.nconmax = max(cfg.sim.nconmax or 0, 55 + _CONTACTS_PER_CUBE * num_cubes)
     _want_one_of(cfg, cubes)
     cfg.scene.sensors += (_camera(("depth", "segmentation")),)
