@@ -9,6 +9,7 @@ import mujoco
 
 from mjlab.entity._variant_slots import MESH, Shared, Slot
 from mjlab.utils.spec import (
+    compile_composed,
     copy_material_data,
     copy_mesh_data,
     copy_texture_data,
@@ -195,6 +196,6 @@ def _make_hulls(
         for name in needed
     ]
     if users:
-        merged.compile()
+        compile_composed(merged)
     for user in users:
         merged.delete(user)

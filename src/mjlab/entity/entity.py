@@ -30,7 +30,7 @@ from mjlab.entity.state_writer import EnvIds
 from mjlab.entity.structure import find_joints, place_body
 from mjlab.utils import spec_config as spec_cfg
 from mjlab.utils.lab_api.string import resolve_matching_names
-from mjlab.utils.spec import auto_wrap_fixed_base_mocap
+from mjlab.utils.spec import auto_wrap_fixed_base_mocap, compile_composed
 from mjlab.utils.state import stateful
 from mjlab.utils.xml import fix_spec_xml, strip_buffer_textures
 
@@ -267,7 +267,7 @@ class Entity(NamedElements, EntityCommands):
 
     def compile(self) -> mujoco.MjModel:
         """Compile the entity alone."""
-        return self._spec.compile()
+        return compile_composed(self._spec)
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
         """Tie the entity to a simulation.

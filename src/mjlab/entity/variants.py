@@ -38,6 +38,7 @@ from mjlab.sim.randomization import (
     put_variant_model,
 )
 from mjlab.sim.randomization import VARIANT_DEPENDENT_FIELDS as VARIANT_DEPENDENT_FIELDS
+from mjlab.utils.spec import compile_composed
 
 InertialMode = Literal["mesh-derived", "diagonal", "fullinertia"]
 """Source of a body's inertia: its geoms, `diaginertia` or `fullinertia`."""
@@ -238,7 +239,7 @@ def _compiled(name: str, spec: mujoco.MjSpec) -> mujoco.MjModel:
     spec.compiler.discardvisual = False
     spec.compiler.fusestatic = False
     try:
-        return spec.compile()
+        return compile_composed(spec)
     except ValueError as error:
         raise ValueError(f"Variant {name!r} does not compile: {error}") from error
 

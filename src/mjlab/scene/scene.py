@@ -32,7 +32,7 @@ from mjlab.sensor import (
     SensorContext,
 )
 from mjlab.terrains.terrain_entity import TerrainEntity, TerrainEntityCfg
-from mjlab.utils.spec import export_spec, make_asset_paths_absolute
+from mjlab.utils.spec import compile_composed, export_spec, make_asset_paths_absolute
 from mjlab.utils.state import stateful
 
 if TYPE_CHECKING:
@@ -260,7 +260,7 @@ class Scene:
 
     def compile(self) -> mujoco.MjModel:
         """Compile the scene."""
-        return self._spec.compile()
+        return compile_composed(self._spec)
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any) -> None:
         """Tie terrain, entities and sensors to a simulation.
@@ -273,7 +273,7 @@ class Scene:
         if any(body.id < 0 for body in self._spec.bodies):
             # The model came from a copy of the spec, so that elements without a name do not know
             # their ids yet.
-            self._spec.compile()
+            compile_composed(self._spec)
         for part in (*self._entities.values(), *self._sensors.values()):
             part.initialize(mj_model, model, data, self._device)
         rays = [sensor for sensor in self._sensors.values() if isinstance(sensor, RayCastSensor)]

@@ -26,6 +26,7 @@ from mjlab.sim.engine import (
 )
 from mjlab.sim.randomization import RecomputeLevel, VariantInfo, VariantValues, is_structure
 from mjlab.utils.nan_guard import NanGuard
+from mjlab.utils.spec import compile_composed
 
 logger = logging.getLogger(__name__)
 
@@ -564,6 +565,6 @@ def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
         # randomized centre of mass would need in full.
         body.simple = 0
     try:
-        return spec.compile()
+        return compile_composed(spec)
     except ValueError as error:
         raise ValueError(f"The scene does not compile: {error}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import warnings
 from collections.abc import Callable, Collection
 from typing import Any
 
@@ -27,6 +28,17 @@ MOCAP_BASE_NAME = "mocap_base"
 
 # What belongs to an element's place in its spec rather than to what it is.
 _NOT_DATA = {"name", "id", "signature", "classname", "compiler"}
+
+
+def compile_composed(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile a spec that others were attached to without a prefix.
+
+    MuJoCo warns at each compilation that such a spec may not be saved correctly; what this package
+    saves, it repairs (`fix_spec_xml`).
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Attaching a spec with an empty prefix")
+        return spec.compile()
 
 
 def get_free_joint(spec: mujoco.MjSpec) -> mujoco.MjsJoint | None:
