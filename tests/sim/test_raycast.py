@@ -1,4 +1,4 @@
-"""What rays meet, on both engines, and that looking only at what is near changes nothing."""
+"""Rays on both engines, and the ground that the native engine looks up instead of casting them."""
 
 from __future__ import annotations
 
@@ -169,47 +169,36 @@ def test_both_engines_meet_the_same_on_any_ray(on_cuda, cuda_device):
     assert close.float().mean() > 0.995
 
 
-# Only what is near.
+# Ground that is looked up.
 
 
-def terrain_model(turned: bool, moving: bool, hills: bool, meshes: bool = False) -> mujoco.MjModel:
-    """Blocks, drums, hills and rocks in rows, with something that moves above them."""
+def terrain_model(hills: bool = False, kind: str = "BOX", turn: float = 0.0) -> mujoco.MjModel:
+    """Blocks in rows above a floor, perhaps with hills beside them, and a ball above."""
     rng = np.random.default_rng(0)
     spec = mujoco.MjSpec()
-    kinds = [mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER]
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, -0.4])
     for i in range(12):
         for j in range(12):
-            geom = spec.worldbody.add_geom(
-                type=kinds[rng.integers(2)],
-                size=[0.25, 0.25, 0.3],
-                pos=[0.5 * i - 3, 0.5 * j - 3, 0.2 * rng.random()],
-            )
-            if turned:
-                geom.alt.euler = list(rng.uniform(-20, 20, 3))
-    if hills:
-        for k in range(2):
-            heights = rng.random(400).astype(np.float32)
-            spec.add_hfield(name=f"h{k}", nrow=20, ncol=20, size=[1, 1, 0.4, 0.2], userdata=heights)
             spec.worldbody.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=f"h{k}", pos=[4.0 + 2 * k, 0, 0]
+                type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"),
+                size=[0.25, rng.uniform(0.2, 0.3), 0.3],
+                pos=[0.5 * i - 3, 0.5 * j - 3, 0.2 * rng.random()],
+                quat=[1, 0, 0, turn],
             )
-    for k in range(8 * meshes):
-        spec.add_mesh(name=f"rock{k}", uservert=rng.uniform(-0.5, 0.5, 36))
+    for k in range(2 * hills):
+        heights = rng.random(400).astype(np.float32)
+        spec.add_hfield(name=f"h{k}", nrow=20, ncol=20, size=[1, 1, 0.4, 0.15], userdata=heights)
         spec.worldbody.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=f"rock{k}",
-            pos=[k - 3, 3.5, 0.1 * k],
-            quat=rng.normal(size=4),
+            type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=f"h{k}", pos=[4.0 + 2 * k, 0, 0]
+        )
+        # Out of the ground here and there, but not out of the summit.
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.6, 0.5, 0.2], pos=[4.0 + 2 * k, 0, 0]
         )
     body = spec.worldbody.add_body(name="body", pos=[0, 0, 1])
     body.add_freejoint()
-    body.add_geom(size=[0.05, 0.05, 0.05], group=0 if moving else 2)
+    body.add_geom(name="ball", size=[0.05, 0.05, 0.05], group=2)
     return spec.compile()
-
-
-def mj_ray(model, data, origin, direction, groups, exclude) -> tuple[float, np.ndarray]:
-    return mj_ray_hit(model, data, origin, direction, groups, exclude)[:2]
 
 
 def mj_ray_hit(model, data, origin, direction, groups, exclude=-1) -> tuple[float, np.ndarray, int]:
@@ -221,78 +210,95 @@ def mj_ray_hit(model, data, origin, direction, groups, exclude=-1) -> tuple[floa
     return distance, normal, int(geom[0])
 
 
-@pytest.mark.parametrize("turned", [False, True])
-@pytest.mark.parametrize("moving", [False, True])
-def test_rays_against_what_is_near_are_those_of_mj_ray_against_everything(turned, moving):
-    model = terrain_model(turned, moving, hills=False)
+def queries(sim: Simulation, monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Return a list that grows by every query of the batch: whether it was of static geoms too."""
+    calls: list[bool] = []
+    original = sim._engine._batch.ray
+
+    def spy(*args, flg_static: bool = True, **kwargs):
+        calls.append(flg_static)
+        return original(*args, flg_static=flg_static, **kwargs)
+
+    monkeypatch.setattr(sim._engine._batch, "ray", spy)
+    return calls
+
+
+@pytest.mark.parametrize("groups", [(0,), None])
+def test_rays_that_are_looked_up_are_those_of_mj_ray(groups, monkeypatch):
+    model = terrain_model()
     data = mujoco.MjData(model)
-    num_envs, groups = 4, (0,)
-    sim = Simulation(num_envs, SimulationCfg(engine="native"), model=model, device="cpu")
+    sim = Simulation(4, SimulationCfg(engine="native"), model=model, device="cpu")
+    calls = queries(sim, monkeypatch)
     generator = torch.Generator().manual_seed(1)
-    grid = torch.stack(torch.meshgrid(torch.arange(8.0), torch.arange(9.0), indexing="ij"), -1)
-    grid = torch.cat((grid.flatten(0, 1) * 0.1 - 0.4, torch.full((72, 1), 0.9)), dim=-1)
-    tilted = torch.nn.functional.normalize(torch.randn(72, 3, generator=generator), dim=-1)
-    tilted[..., 2] = -3.0
-    tilted = torch.nn.functional.normalize(tilted, dim=-1)
-    reach = torch.full((72,), 1.5)
-    used = 0
-    for step in range(5):
-        centre = torch.rand(num_envs, 1, 3, generator=generator) * 8 - 4
-        centre[..., 2] = 0.0
-        centre[0] += 30.0 * (step == 3)
-        sim.data.qpos[:, :3] = centre[:, 0] + torch.tensor([0.02, 0.03, 0.8])
-        origins = (grid + centre).contiguous()
-        directions = torch.tensor(DOWN) if step < 3 else tilted
-        directions = directions.expand(num_envs, 72, 3).contiguous()
-        distances, normals, geoms = sim.raycast(origins, directions, groups, None, reach)
-        used += sum(len(p.parts) > 0 for p in sim._engine._rays._plans.values())
-        for env in range(num_envs):
-            data.qpos[:3] = sim.data.qpos[env, :3].numpy()
-            mujoco.mj_kinematics(model, data)
-            for r in range(0, 72, 7):
-                expected, normal = mj_ray(
-                    model, data, origins[env, r].numpy(), directions[env, r].numpy(), groups, -1
-                )
-                miss = expected > 1.5 or expected < 0
-                assert distances[env, r].item() == pytest.approx(-1 if miss else expected, abs=1e-6)
-                assert (geoms[env, r] < 0).item() == miss
-                if not miss:
-                    np.testing.assert_allclose(normals[env, r], normal, atol=1e-6)
-    # All looked only at what is near, but the first and the one in which the rays were tilted.
-    assert used == 3
+    # From above, from within the blocks and from below; above the blocks and beside them.
+    low, high = torch.tensor([-4.0, -4.0, -0.6]), torch.tensor([4.0, 4.0, 1.2])
+    origins = low + torch.rand(4, 200, 3, generator=generator) * (high - low)
+    origins[0] += torch.tensor([30.0, 0.0, 0.0])
+    sim.data.qpos[:, :3] = origins[:, 0] - torch.tensor([0.01, 0.02, 0.3])
+    directions = torch.tensor(DOWN).repeat(4, 200, 1)
+    distances, normals, geoms = sim.raycast(origins, directions, groups)
+    assert calls == ([] if groups else [False])
+    kinds = set()
+    for env in range(4):
+        data.qpos[:] = sim.data.qpos[env]
+        mujoco.mj_kinematics(model, data)
+        for r in range(200):
+            ray = origins[env, r].numpy(), directions[env, r].numpy()
+            distance, normal, geom = mj_ray_hit(model, data, *ray, groups)
+            assert distances[env, r].item() == pytest.approx(distance, rel=1e-6, abs=1e-6)
+            assert geoms[env, r].item() == geom
+            np.testing.assert_allclose(normals[env, r], normal, atol=1e-7)
+            kinds.add((int(model.geom_type[geom]) if geom >= 0 else None, float(normal[2])))
+    assert {(mujoco.mjtGeom.mjGEOM_BOX, -1.0), (mujoco.mjtGeom.mjGEOM_PLANE, 1.0)} < kinds
+    assert (None, 0.0) in kinds
+
+
+@pytest.fixture(scope="module")
+def hilly():
+    """A simulation that looks the ground up, and one that tries every geom."""
+    model = terrain_model(hills=True)
+    sims = [
+        Simulation(2, SimulationCfg(engine="native"), model=model, device="cpu") for _ in range(2)
+    ]
+    # Geoms that are not as compiled are not looked up. This one is turned as it was.
+    sims[1].expand_model_fields(("geom_quat",))
+    sims[1].model.geom_quat[:, 1] *= -1.0
+    return sims
 
 
 @settings(max_examples=20, deadline=None)
 @given(
-    x=st.floats(-5, 8), y=st.floats(-4, 4), z=st.floats(-0.3, 1.2), tilt=st.floats(-0.5, 0.5),
+    x=st.floats(-5, 8), y=st.floats(-4, 4), z=st.floats(-0.3, 1.2),
     spread=st.sampled_from([0.02, 0.3, 2.0]),
 )  # fmt: skip
-def test_what_is_near_does_not_change_hills_wherever_the_rays_are(hilly, x, y, z, tilt, spread):
+def test_hills_are_looked_up_as_they_are_met_wherever_the_rays_are(hilly, x, y, z, spread):
     sim, everything = hilly
     grid = torch.linspace(-1, 1, 40)[:, None] * torch.tensor([1.0, 0.7, 0.0]) * spread
     origins = (grid + torch.tensor([x, y, z])).repeat(2, 1, 1)
     origins[1] += 0.3
-    direction = torch.nn.functional.normalize(torch.tensor([tilt, 0.1 * tilt, -1.0]), dim=0)
-    directions = direction.expand(2, 40, 3).contiguous()
-    reach = torch.full((40,), 2.0)
-    every = everything.raycast(origins, directions, None, None, reach)
-    # The first call may find rays outside of the windows made before, the second does not.
-    for _ in range(2):
-        near = sim.raycast(origins, directions, None, None, reach)
-        for a, b in zip(near, every, strict=True):
+    rays = origins, torch.tensor(DOWN).repeat(2, 40, 1), None, None, torch.full((40,), 2.0)
+    with pytest.MonkeyPatch.context() as patch:
+        calls = queries(sim, patch), queries(everything, patch)
+        for a, b in zip(sim.raycast(*rays), everything.raycast(*rays), strict=True):
             torch.testing.assert_close(a, b, atol=1e-6, rtol=0)
-    assert all(p.parts for p in sim._engine._rays._plans.values())
+    assert True not in calls[0]
+    assert True in calls[1]
 
 
-def test_the_same_rays_may_reach_farther_than_the_last_time(hilly):
+def test_what_stands_out_of_a_height_field_is_met_first(hilly):
     sim, everything = hilly
-    origins = torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(5)) * 2.0
-    slanted = torch.nn.functional.normalize(torch.tensor([0.9, 0.4, -0.5]), dim=0)
-    directions = slanted.expand(2, 40, 3).contiguous()
-    for reach in (0.2, 0.2, 3.0, 3.0):
-        rays = (origins, directions, None, None, torch.full((40,), reach))
-        for near, every in zip(sim.raycast(*rays), everything.raycast(*rays), strict=True):
-            torch.testing.assert_close(near, every, atol=1e-6, rtol=0)
+    grid = torch.linspace(-0.983, 0.971, 60)
+    places = torch.stack(
+        torch.meshgrid(grid + 4.0, grid + 0.0123, torch.ones(1), indexing="ij"), -1
+    )
+    origins = places.reshape(1, -1, 3).repeat(2, 1, 1)
+    directions = torch.tensor(DOWN).expand_as(origins).contiguous()
+    near, every = (s.raycast(origins, directions) for s in hilly)
+    kinds = sim.mj_model.geom_type[near[2]].flatten().tolist()
+    assert set(kinds) == {int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_HFIELD)}
+    assert torch.equal(near[2], every[2])
+    torch.testing.assert_close(near[0], every[0], atol=1e-6, rtol=0)
+    torch.testing.assert_close(near[1], every[1], atol=1e-6, rtol=0)
 
 
 def test_rays_are_cast_under_inference_mode_as_a_rollout_does(hilly):
@@ -306,47 +312,64 @@ def test_rays_are_cast_under_inference_mode_as_a_rollout_does(hilly):
                 torch.testing.assert_close(near, every, atol=1e-6, rtol=0)
 
 
-@pytest.fixture(scope="module")
-def hilly():
-    """A simulation that looks at what is near, and one that looks at everything."""
-    model = terrain_model(turned=False, moving=True, hills=True)
-    sims = [
-        Simulation(2, SimulationCfg(engine="native"), model=model, device="cpu") for _ in range(2)
-    ]
-    # Geoms that are not as compiled are not sought by place. This one is turned as it was.
-    sims[1].expand_model_fields(("geom_quat",))
-    sims[1].model.geom_quat[:, 1] *= -1.0
-    points = torch.zeros(2, 40, 3)
-    points[..., 2] = 2.0
-    for _ in range(2):
-        sims[0].raycast(points, torch.tensor(DOWN).repeat(2, 40, 1), None, None, torch.ones(40))
-    return sims
+@pytest.mark.parametrize(
+    ("model", "direction"),
+    [({"kind": "CYLINDER"}, DOWN), ({"turn": 0.2}, DOWN), ({}, (0.6, 0.0, -0.8))],
+    ids=["another kind", "turned", "slanted"],
+)
+def test_what_is_not_looked_up_is_asked_of_mujoco(model, direction, monkeypatch):
+    model = terrain_model(**model)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    sim = Simulation(2, SimulationCfg(engine="native"), model=model, device="cpu")
+    calls = queries(sim, monkeypatch)
+    origins = 4.0 * torch.rand(2, 30, 3, generator=torch.Generator().manual_seed(2)) - 2.0
+    directions = torch.tensor(direction).repeat(2, 30, 1)
+    distances = sim.raycast(origins, directions, (0,))[0]
+    assert calls == [True]
+    for r in range(30):
+        ray = origins[1, r].numpy(), directions[1, r].numpy()
+        expected = mj_ray_hit(model, data, *ray, (0,))[0]
+        assert distances[1, r].item() == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
-def test_what_is_near_is_met_as_everything_is_to_the_bit():
-    model = terrain_model(turned=True, moving=True, hills=True, meshes=True)
-    sim = Simulation(64, SimulationCfg(engine="native"), model=model, device="cpu")
-    generator = torch.Generator().manual_seed(3)
-    places = torch.rand(64, 1, 3, generator=generator) * torch.tensor([12.0, 8.0, 1.0])
-    spots = 0.3 * torch.rand(30, 3, generator=generator) - torch.tensor([4.0, 4.0, 0.2])
-    origins = places + spots
-    directions = torch.randn(30, 3, generator=generator) * torch.tensor([0.2, 0.2, 1.0])
-    directions = torch.nn.functional.normalize(directions, dim=-1).repeat(64, 1, 1)
-    reach = torch.full((30,), 1.5)
-    # The first call looks at everything, the second at what is near.
-    everything, near = [sim.raycast(origins, directions, None, None, reach) for _ in range(2)]
-    assert all(plan.parts for plan in sim._engine._rays._plans.values())
-    met = model.geom_type[everything[2][everything[0] >= 0].numpy()]
-    kinds = {"PLANE", "HFIELD", "CYLINDER", "BOX", "MESH"}
-    assert {mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_") for kind in met} >= kinds
-    for a, b in zip(everything, near, strict=True):
-        assert torch.equal(a, b)
+def test_a_query_that_fails_in_one_environment_is_a_miss_there_alone(shapes):
+    if shapes.capabilities.name != "native":
+        pytest.skip("MuJoCo Warp does not raise")
+    origins, directions = rays(((10.0, 0.0, 3.0), DOWN), ((60.0, 0.0, 0.5), DOWN))
+    expected = [values[1].clone() for values in shapes.raycast(origins, directions)]
+    # MuJoCo raises for a direction without a length.
+    directions[0, 1] = 0.0
+    distances, normals, geoms = shapes.raycast(origins, directions)
+    assert distances[0].tolist() == geoms[0].tolist() == [-1, -1]
+    assert (normals[0] == 0).all()
+    for values, others in zip((distances, normals, geoms), expected, strict=True):
+        assert torch.equal(values[1], others)
+
+
+def test_an_environment_that_has_diverged_does_not_touch_the_others():
+    sim = Simulation(
+        3, SimulationCfg(engine="native"), model=terrain_model(hills=True), device="cpu"
+    )
+    origins = torch.rand(3, 20, 3) * torch.tensor([6.0, 1.0, 1.0]) + torch.tensor([0.0, 0.0, 0.5])
+    directions = torch.tensor(DOWN).repeat(3, 20, 1)
+    expected = [values.clone() for values in sim.raycast(origins, directions)]
+    for bad in (torch.nan, torch.inf, -torch.inf):
+        sim.data.qpos[1, :3] = bad
+        diverged = origins.clone()
+        diverged[1] = bad
+        distances, normals, geoms = sim.raycast(diverged, directions)
+        assert (distances[1] == -1).all()
+        assert (geoms[1] == -1).all()
+        for values, before in zip((distances, normals, geoms), expected, strict=True):
+            assert torch.equal(values[[0, 2]], before[[0, 2]])
 
 
 PLANES = """
 <mujoco><worldbody>
   <geom name="ground" type="plane" size="0 0 1" pos="0 0 -.3"/>
-  <geom name="table" type="plane" size="1.5 0 .1" pos=".2 .1 .4" euler="10 -20 30"/>
+  <geom name="table" type="plane" size="1.5 0 .1" pos=".2 .1 .4" group="4" euler="10 -20 30"/>
+  <geom name="bench" type="plane" size="1.5 0 .1" pos=".2 .1 .4"/>
   <geom name="shelf" type="plane" size=".5 .8 .1" pos="0 0 1.1"/>
   <geom name="lamp" type="sphere" size=".5" pos="0 0 1.5" group="1"/>
   <body name="ball" pos="0 0 3"><freejoint/><geom size=".1" group="3"/></body>
@@ -388,17 +411,19 @@ def test_rays_against_nothing_but_planes_are_those_of_mj_ray(planes, seed, slant
 
 @pytest.mark.parametrize(
     ("groups", "excluded", "is_alone"),
-    [((0,), -1, True), ((0,), 1, True), ((0,), 0, False), ((0, 1), -1, False), ((2,), -1, False)],
-)
-def test_only_rays_that_meet_fixed_planes_alone_are_computed_without_a_query(
-    planes, groups, excluded, is_alone
+    [
+        ((0,), -1, True), ((0,), 1, True), ((0,), 0, False), ((0, 1), -1, False),
+        ((2,), -1, False), ((4,), -1, False),
+    ],
+)  # fmt: skip
+def test_only_rays_that_meet_fixed_upright_planes_alone_are_computed_without_a_query(
+    planes, groups, excluded, is_alone, monkeypatch
 ):
     sim, _ = planes
+    calls = queries(sim, monkeypatch)
     origins, directions = rays(((0.0, 0.0, 2.5), DOWN))
-    for _ in range(2):
-        sim.raycast(origins, directions, groups, torch.tensor([excluded], dtype=torch.int32))
-    plan = list(sim._engine._rays._plans.values())[-1]
-    assert (plan.planes is not None) == is_alone
+    sim.raycast(origins, directions, groups, torch.tensor([excluded], dtype=torch.int32))
+    assert calls == ([] if is_alone else [True])
 
 
 def test_planes_that_a_randomization_has_moved_are_met_where_they_are():
@@ -413,7 +438,7 @@ def test_planes_that_a_randomization_has_moved_are_met_where_they_are():
 
 
 def test_geoms_that_a_randomization_has_moved_are_met_where_they_are():
-    model = terrain_model(turned=False, moving=False, hills=False)
+    model = terrain_model()
     sim = Simulation(3, SimulationCfg(engine="native"), model=model, device="cpu")
     origins = torch.tensor([0.0, 0.0, 2.0]).repeat(3, 4, 1)
     directions = torch.tensor(DOWN).repeat(3, 4, 1)
@@ -425,28 +450,13 @@ def test_geoms_that_a_randomization_has_moved_are_met_where_they_are():
     torch.testing.assert_close(after, before + moved, atol=1e-5, rtol=0)
 
 
-def queries_of_everything(sim: Simulation, monkeypatch: pytest.MonkeyPatch) -> list[bool]:
-    """Return a list that grows whenever all geoms are tried, static ones included."""
-    calls: list[bool] = []
-    rays_of = sim._engine._rays
-    original = rays_of._cast_all
-
-    def spy(*args, static: bool = True, **kwargs):
-        if static:
-            calls.append(True)
-        return original(*args, static=static, **kwargs)
-
-    monkeypatch.setattr(rays_of, "_cast_all", spy)
-    return calls
-
-
-def test_randomizing_what_moves_leaves_the_ground_looked_up_by_place(monkeypatch, caplog):
-    model = terrain_model(turned=False, moving=True, hills=False)
+def test_randomizing_what_moves_leaves_the_ground_looked_up(monkeypatch, caplog):
+    model = terrain_model()
     sim = Simulation(3, SimulationCfg(engine="native"), model=model, device="cpu")
     origins = torch.tensor([0.0, 0.0, 3.0]).repeat(3, 4, 1)
     directions = torch.tensor(DOWN).repeat(3, 4, 1)
     sim.raycast(origins, directions)
-    calls = queries_of_everything(sim, monkeypatch)
+    calls = queries(sim, monkeypatch)
     fields = ("geom_size", "geom_pos", "geom_rgba", "geom_friction", "body_pos", "geom_solref")
     sim.expand_model_fields(fields)
     ball = model.ngeom - 1
@@ -455,13 +465,8 @@ def test_randomizing_what_moves_leaves_the_ground_looked_up_by_place(monkeypatch
     sim.model.geom_rgba[:, :, 0] = 0.1
     sim.model.geom_rgba[0, ball, 3] = 0.0
     sim.model.geom_friction[:] = 0.3
-    # Colours that differ make it a query of another kind, whose first call looks at everything.
-    everything = sim.raycast(origins, directions)
-    calls.clear()
-    near = sim.raycast(origins, directions)
-    assert calls == []
-    assert all(torch.equal(a, b) for a, b in zip(everything, near, strict=True))
-    distances, _, geoms = near
+    distances, _, geoms = sim.raycast(origins, directions)
+    assert calls == [False]
     assert caplog.text == ""
     # The first is transparent, the second large, and the third stands aside.
     assert geoms[:, 0].eq(ball).tolist() == [False, True, False]
@@ -469,23 +474,37 @@ def test_randomizing_what_moves_leaves_the_ground_looked_up_by_place(monkeypatch
 
 
 def test_a_ground_that_differs_is_found_by_trying_everything_and_said_once(monkeypatch, caplog):
-    model = terrain_model(turned=False, moving=True, hills=False)
+    model = terrain_model()
     sim = Simulation(3, SimulationCfg(engine="native"), model=model, device="cpu")
     origins = torch.tensor([0.0, 0.0, 3.0]).repeat(3, 4, 1)
     directions = torch.tensor(DOWN).repeat(3, 4, 1)
     before = [sim.raycast(origins, directions)[0] for _ in range(2)][-1]
-    calls = queries_of_everything(sim, monkeypatch)
-    sim.raycast(origins, directions)
-    assert calls == []
+    calls = queries(sim, monkeypatch)
     sim.expand_model_fields(("geom_pos",))
     sim.model.geom_pos[1, : model.ngeom - 1, 2] -= 0.1
     with caplog.at_level("WARNING"):
         after = [sim.raycast(origins, directions)[0] for _ in range(2)][-1]
-    assert len(calls) == 2
+    assert calls == [True, True]
     assert len(caplog.records) == 1
     assert "'geom_pos' of geoms that never move" in caplog.text
     torch.testing.assert_close(after[[0, 2]], before[[0, 2]])
     # As it was compiled again.
     sim.model.geom_pos.copy_(sim.get_default_field("geom_pos"))
     sim.raycast(origins, directions)
-    assert len(calls) == 2
+    assert calls == [True, True, False]
+
+
+@pytest.mark.parametrize("compiled", [0.0, 1.0])
+def test_a_block_is_met_where_it_is_visible(compiled):
+    """Whether it was compiled transparent or not, in the one environment in which it is not."""
+    model = terrain_model()
+    block = 1
+    model.geom_rgba[block, 3] = compiled
+    sim = Simulation(2, SimulationCfg(engine="native"), model=model, device="cpu")
+    origins = torch.tensor([-3.0, -3.0, 3.0]).repeat(2, 1, 1)
+    directions = torch.tensor(DOWN).repeat(2, 1, 1)
+    sim.raycast(origins, directions)
+    sim.expand_model_fields(("geom_rgba",))
+    sim.model.geom_rgba[:, block, 3] = torch.tensor([0.0, 1.0])
+    for _ in range(2):
+        assert sim.raycast(origins, directions)[2].flatten().tolist() == [0, block]

@@ -12,8 +12,7 @@ import torch
 from mjlab.sim.native.camera_geoms import HFIELD, MESH, GeomTable, PosedGeoms
 from mjlab.sim.native.camera_pixels import Lens
 from mjlab.sim.native.camera_slots import SlotBatch
-from mjlab.sim.native.ray_casting import Hits, Passed
-from mjlab.sim.native.ray_culling import CullingRule
+from mjlab.sim.native.rays import CullingRule, Hits, Passed
 
 Array = np.ndarray
 

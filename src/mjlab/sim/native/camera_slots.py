@@ -10,8 +10,7 @@ import numpy as np
 import torch
 
 from mjlab.sim.native.camera_geoms import HFIELD, MESH, SPHERE, GeomTable, PosedGeoms
-from mjlab.sim.native.ray_casting import Hits, Passed, cast_through
-from mjlab.sim.native.ray_tiles import slot_model
+from mjlab.sim.native.rays import Hits, Passed, cast_through, slot_model
 
 # More slots than are needed now, so that they are still enough when the camera has turned.
 _HEADROOM = 1.3

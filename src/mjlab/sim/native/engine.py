@@ -382,7 +382,6 @@ class NativeEngine(Engine):
             self._rays = NativeRays(
                 self._model,
                 self._batch,
-                self._make_batch,
                 lambda: (
                     self.data_field("geom_xpos").numpy(),
                     self.data_field("geom_xmat").numpy(),
