@@ -19,7 +19,8 @@ TABLE = """
 <mujoco><worldbody>
   <geom name="floor" type="plane" size="0 0 1" rgba="1 .5 0 1"/>
   <geom name="ball" type="sphere" size=".5" pos="0 0 1" rgba="0 .5 1 1" group="1"/>
-  <geom name="post" type="sphere" size=".2" pos="1.67 1.67 .5" rgba="0 0 0 0" group="3"/>
+  <geom name="post" type="sphere" size=".2" pos="1.67 1.67 .5" rgba="0 0 0 1" group="3"/>
+  <geom name="glass" type="sphere" size=".2" pos="-1.67 1.67 .5" rgba="0 0 0 0" group="3"/>
   <camera name="down" pos="0 0 3" fovy="90"/>
   <camera name="map" pos="0 0 3" fovy="4" projection="orthographic"/>
   <camera name="up" pos="0 0 3" xyaxes="1 0 0 0 -1 0"/>

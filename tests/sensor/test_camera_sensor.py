@@ -102,11 +102,30 @@ def test_each_sensor_sees_its_own_geom_groups_though_they_share_a_camera(views):
     assert not (data["down"].segmentation[..., 0] == model.geom("room/post").id).any()
 
 
-def test_what_is_fully_transparent_is_seen(views):
+def test_what_is_fully_transparent_is_not_seen(views):
     model, data = views
-    is_post = data["wide"].segmentation[0, ..., 0] == model.geom("room/post").id
+    ids = data["wide"].segmentation[0, ..., 0]
+    is_post = ids == model.geom("room/post").id
     assert data["wide"].rgb[0][is_post].eq(0).all(), "the post is black"
     assert is_post.any()
+    # Its mirror image in the plane x = 0 has an alpha of 0.
+    assert not (ids == model.geom("room/glass").id).any()
+    assert (ids.flip(1)[is_post] == model.geom("room/floor").id).all()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_transparency_is_that_of_the_material_and_differs_between_environments(engine):
+    xml = """<mujoco><asset><material name="clear" rgba="1 1 1 0"/></asset><worldbody>
+      <geom name="near" size=".5" pos="0 0 2" material="clear"/><geom name="far" size=".5"/>
+      <camera name="down" pos="0 0 4"/></worldbody></mujoco>"""
+    eye = camera(data_types=("depth",))
+    sim, scene = scene_with(eye, xml=xml, engine=engine, num_envs=3)
+    sim.expand_model_fields(["geom_rgba", "mat_rgba"])
+    sim.model.geom_rgba[1, sim.mj_model.geom("room/near").id] = 1.0
+    sim.model.mat_rgba[2, :, 3] = 0.5
+    sense(sim)
+    depth = scene["cam"].data.depth[:, 2, 2, 0]
+    assert depth.tolist() == pytest.approx([3.5, 1.5, 1.5], abs=1e-5)
 
 
 def test_rays_of_an_orthographic_camera_are_parallel(views):
@@ -404,6 +423,44 @@ def test_an_environment_that_has_diverged_leaves_the_images_of_others_alone(engi
         assert data.rgb[[0, 2]].equal(rgb[[0, 2]])
         assert data.depth[[0, 2]].equal(depth[[0, 2]])
         assert not data.depth.isnan().any()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_camera_that_has_diverged_sees_no_geom_but_the_sky(engine):
+    """Textures and shadows have no place to be looked up or cast from there."""
+    eye = camera("rider", None, parent_body="ball/ball", use_shadows=True)
+    sim, scene = scene_with(eye, xml=ROOM, engine=engine, num_envs=3, ball=BALL)
+    sense(sim)
+    before = scene["rider"].data.rgb.clone()
+    sim.data.qpos[1] = torch.nan
+    sense(sim)
+    data = scene["rider"].data
+    assert data.rgb[[0, 2]].equal(before[[0, 2]])
+    assert data.segmentation[1].eq(-1).all()
+    assert data.depth[1].eq(0.0).all()
+
+
+# Shadow rays start 0.1 mm above the surface.
+@pytest.mark.parametrize("height", [-1.0, -0.9999])
+def test_a_light_on_a_surface_casts_no_shadow_there(height):
+    """MuJoCo raises for a ray without a direction."""
+    xml = f"""<mujoco><worldbody><light type="point" pos="0 0 {height}"/><camera name="eye"/>
+      <geom type="plane" size="0 0 1" pos="0 0 -1"/></worldbody></mujoco>"""
+    eye = camera("eye", "room/eye", width=1, height=1, data_types=("rgb",), use_shadows=True)
+    _, data = look(eye, xml=xml)
+    assert (data.rgb > 0).all()
+
+
+def test_an_environment_for_whose_rays_mujoco_raises_has_no_shadows():
+    eye = camera("eye", "room/front", data_types=("rgb",), use_shadows=True, width=16, height=16)
+    sim, scene = scene_with(eye, xml=ROOM, num_envs=3, ball=BALL)
+    sense(sim)
+    before = scene["eye"].data.rgb.clone()
+    # A sun that shines nowhere, which shadow rays cannot point to.
+    sim.data.light_xdir[1, sim.mj_model.light("room/sun").id] = 0.0
+    sim.sense()
+    assert scene["eye"].data.rgb[[0, 2]].equal(before[[0, 2]])
+    assert not scene["eye"].data.rgb[1].equal(before[1])
 
 
 def test_images_are_part_of_the_state_of_an_environment():

@@ -84,7 +84,7 @@ class CameraSensor(Sensor[CameraSensorData]):
     Images are rendered by `sim.sense()`: once per environment step, after resets and commands. So
     observations see the current state, and rewards and terminations the images of the step before.
 
-    A camera sees surfaces from outside only, however transparent they are. Several sensors may look
+    A camera sees surfaces from outside only, and no geom with an alpha of 0; others are opaque. Several sensors may look
     through one camera, with images of other sizes and of other geom groups.
     """
 
