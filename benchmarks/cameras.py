@@ -29,7 +29,7 @@ from timing import alternate
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.sim import Simulation
-from mjlab.sim.rendering import CameraView
+from mjlab.sim.engine import CameraView
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.viewer.errors import RenderingUnavailableError
 from mjlab.viewer.gl_context import open_renderer

@@ -14,7 +14,7 @@ from gpu_parts.device import wait
 from gpu_parts.options import Options
 from gpu_parts.tasks import LIFT_CUBE_RGB, close, stepped_env
 from mjlab.envs import ManagerBasedRlEnv
-from mjlab.sim.rendering import CameraView
+from mjlab.sim.engine import CameraView
 
 mjw: Any = mujoco_warp
 wp: Any = warp

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from mjlab.sim.config import MujocoCfg, SimulationCfg
-from mjlab.sim.field_lists import ACCELERATION_FIELDS
+from mjlab.sim.engine import ACCELERATION_FIELDS
 from mjlab.sim.simulation import Simulation
 
 from .parity_models import MODELS

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from mjlab.sim.fields import SharedField
+from mjlab.sim.simulation import SharedField
 
 WRITES: dict[str, Callable[[torch.Tensor], object]] = {
     "out": lambda field: torch.add(torch.zeros(len(field), 2), 5.0, out=field),

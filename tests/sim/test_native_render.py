@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mjlab.sim import Simulation, SimulationCfg
+from mjlab.sim.engine import CameraView
 from mjlab.sim.native import render as native_render
-from mjlab.sim.rendering import CameraView
 
 SHAPES = ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 ALL = ("rgb", "depth", "segmentation")

@@ -25,7 +25,7 @@ import mjlab
 from mjlab.envs import manager_based_rl_env
 from mjlab.sim import simulation
 from mjlab.sim.engine import Engine
-from mjlab.sim.fields import SharedField
+from mjlab.sim.simulation import SharedField
 
 DEVICE = "cuda:0"
 _SOURCES = str(Path(mjlab.__file__).parent)

@@ -10,7 +10,7 @@ import torch
 
 from mjlab.actuator._columns import EnvIds, as_rows
 from mjlab.actuator.actuator import Actuator, ActuatorCfg, ActuatorCmd
-from mjlab.sim.fields import SharedField
+from mjlab.sim.simulation import SharedField
 from mjlab.utils.spec import create_motor_actuator
 
 if TYPE_CHECKING:

@@ -8,8 +8,7 @@ import mujoco
 import numpy as np
 
 from mjlab.entity.indexing import element_id
-from mjlab.sim.field_lists import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
-from mjlab.sim.variants import VariantColumns
+from mjlab.sim.randomization import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS, VariantColumns
 from mjlab.utils.mujoco import control_columns, dof_width, force_columns, qpos_width
 
 # Kinds of elements, with the beginning of the names of their model fields.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import mujoco
 
-from mjlab.sim.rendering import CAMERA_DATA_TYPES, NUM_GEOM_GROUPS
+from mjlab.sim.engine import CAMERA_DATA_TYPES, NUM_GEOM_GROUPS
 
 if TYPE_CHECKING:
     from mjlab.sensor.camera_sensor import CameraSensor, CameraSensorCfg

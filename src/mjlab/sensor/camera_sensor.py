@@ -11,7 +11,7 @@ import torch
 
 from mjlab.sensor._camera_checks import check_camera_cfg, find_camera, set_field_of_view
 from mjlab.sensor.sensor import Sensor, SensorCfg
-from mjlab.sim.rendering import CameraDataType, CameraView, Images, rendered_geoms
+from mjlab.sim.engine import CameraDataType, CameraView, Images, rendered_geoms
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity

@@ -13,7 +13,7 @@ from mjlab.sensor._camera_checks import check_shared_cameras
 if TYPE_CHECKING:
     from mjlab.sensor.camera_sensor import CameraSensor
     from mjlab.sensor.raycast_sensor import RayCastSensor
-    from mjlab.sim.rendering import CameraView, Images
+    from mjlab.sim.engine import CameraView, Images
 
 RayCast = Callable[..., tuple[torch.Tensor, torch.Tensor, torch.Tensor]]
 """`Simulation.raycast`: origins, directions, geom groups, excluded bodies, reach of each ray."""

@@ -19,6 +19,14 @@ import numpy as np
 import torch
 from mujoco.batch import SimulationError
 
+from mjlab.sim.engine import (
+    BACKGROUND,
+    LENS_FIELDS,
+    CameraView,
+    Images,
+    far_limit,
+    rendered_geoms,
+)
 from mjlab.sim.native.rays import CullingRule, Hits, Passed, cast_through, slot_model
 from mjlab.sim.native.textures import (
     BOX,
@@ -32,14 +40,6 @@ from mjlab.sim.native.textures import (
     Textures,
     of_materials,
     of_pixels,
-)
-from mjlab.sim.rendering import (
-    BACKGROUND,
-    LENS_FIELDS,
-    CameraView,
-    Images,
-    far_limit,
-    rendered_geoms,
 )
 from mjlab.utils.lab_api.math import matrix_from_quat, quat_conjugate, quat_from_matrix, quat_mul
 

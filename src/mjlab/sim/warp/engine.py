@@ -26,21 +26,18 @@ import torch
 import warp
 
 from mjlab.sim.engine import (
+    ACCELERATION_FIELDS,
+    COLLISION_MASKS,
+    INPUTS,
     ROTATION_MATRICES,
+    ZERO_INPUTS,
     Capabilities,
     Engine,
     EngineUnavailableError,
     Stage,
+    check_sensor_fed,
 )
-from mjlab.sim.field_lists import (
-    ACCELERATION_FIELDS,
-    COLLISION_MASKS,
-    CONSTANTS_AT_QPOS0,
-    FIXED_CONSTANTS,
-    INPUTS,
-    ZERO_INPUTS,
-)
-from mjlab.sim.sensor_fed import refuse_without_sensor
+from mjlab.sim.randomization import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
 from mjlab.sim.warp.overflow import OverflowWatch, contacts_per_environment
 from mjlab.sim.warp.rays import WarpRays
 from mjlab.sim.warp.render import WarpRenderer
@@ -48,8 +45,8 @@ from mjlab.utils.lab_api.math import matrix_from_quat, matrix_product
 
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
-    from mjlab.sim.rendering import CameraView, Images
-    from mjlab.sim.variants import VariantValues
+    from mjlab.sim.engine import CameraView, Images
+    from mjlab.sim.randomization import VariantValues
 
 logger = logging.getLogger(__name__)
 
@@ -337,7 +334,7 @@ class WarpEngine(Engine):
             return _as_tensors(self.wp_data.contact)
         if name not in self._data_tensors:
             array = find_data_field(self.wp_data, name)
-            refuse_without_sensor(self.mj_model, name)
+            check_sensor_fed(self.mj_model, name)
             shape = getattr(getattr(self._host, name), "shape", ())
             if name in ROTATION_MATRICES:
                 shape = (*shape[:-1], 3, 3)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import warp
 
-from mjlab.sim.rendering import LENS_FIELDS, CameraView, Images
+from mjlab.sim.engine import LENS_FIELDS, CameraView, Images
 
 if TYPE_CHECKING:
     from mjlab.sim.warp.engine import WarpEngine
