@@ -150,7 +150,7 @@ class EntityData(KinematicsReader, StateWriter):
 
     @property
     def actuator_force(self) -> torch.Tensor:
-        """(N, number of forces) forces of the actuators in turn, before their gear.
+        """(N, number of forces) forces of the actuators in turn, before their gear, in the last substep.
 
         An orientation servo has three, every other actuator one; see `indexing.force_columns`.
         """
@@ -158,23 +158,23 @@ class EntityData(KinematicsReader, StateWriter):
 
     @property
     def qfrc_actuator(self) -> torch.Tensor:
-        """(N, nj) generalized forces of the actuators on the joints."""
+        """(N, nj) generalized forces of the actuators on the joints in the last substep."""
         return self._columns("qfrc_actuator", self._joint_v)
 
     @property
     def qfrc_external(self) -> torch.Tensor:
-        """(N, nj) generalized forces on the joints of wrenches applied to bodies.
+        """(N, nj) generalized forces on the joints of the wrenches now applied to bodies.
 
-        What remains of `qfrc_smooth` without actuators, applied and passive forces, and bias.
+        `sum_b S_j . (tau_b + (p_b - c) x f_b, f_b)` over the bodies b that joint axis j moves, with
+        its motion axis `S_j` (`cdof`) about c, the centre of mass of the tree.
         """
-        at = self._joint_v
-        return (
-            self._columns("qfrc_smooth", at)
-            - self._columns("qfrc_actuator", at)
-            - self._columns("qfrc_applied", at)
-            - self._columns("qfrc_passive", at)
-            + self._columns("qfrc_bias", at)
-        )
+        # Not `qfrc_smooth` without its other parts: those are of different stages of MuJoCo.
+        force, torque = self._columns("xfrc_applied", self._bodies).split(3, dim=-1)
+        arm = self._columns("xipos", self._bodies) - self._tree_com(self._body_trees)
+        wrench = torch.cat((torque + torch.linalg.cross(arm, force), force), dim=-1)
+        # A sum, because products of matrices may be rounded to TF32.
+        below = (self.indexing.moved_bodies[..., None] * wrench[:, None]).sum(dim=2)
+        return (self._columns("cdof", self._joint_v) * below).sum(dim=-1)
 
 
 __getattr__ = older_names(__name__)
