@@ -30,11 +30,13 @@ class EntityData(KinematicsReader, StateWriter):
 
     After `sim.step()` joint positions and velocities are current, and everything that MuJoCo
     derives from them (poses, velocities of links, forces, accelerations) belongs to the state
-    before the last substep, until `sim.forward()`.
+    before the last substep, until `sim.forward()`. In observations poses and velocities are
+    current; forces and accelerations are those of the last substep (`ManagerBasedRlEnv.step`).
     """
 
     _transient = {
         "indexing", "data", "model", "device", "_views", "gravity_vec_w", "forward_vec_b",
+        "moved_envs",
     }  # fmt: skip
 
     POS_DIM = 3
@@ -84,6 +86,9 @@ class EntityData(KinematicsReader, StateWriter):
     """(N, number of sites) commands for site actuators; (N, 0) without such actuators."""
     encoder_bias: torch.Tensor
     """(N, nj) added to joint positions in `joint_pos_biased`; kept over resets."""
+    moved_envs: torch.Tensor | None = None
+    """(N,) bool, where a pose or joint positions were written since the last substep; None for
+    nowhere."""
     _views: dict[Any, torch.Tensor] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -127,7 +132,7 @@ class EntityData(KinematicsReader, StateWriter):
 
     @property
     def joint_acc(self) -> torch.Tensor:
-        """(N, nj) joint accelerations."""
+        """(N, nj) joint accelerations, of the last substep."""
         return self._columns("qacc", self._joint_v)
 
     @property
@@ -150,9 +155,10 @@ class EntityData(KinematicsReader, StateWriter):
 
     @property
     def actuator_force(self) -> torch.Tensor:
-        """(N, number of forces) forces of the actuators in turn, before their gear, in the last substep.
+        """(N, number of forces) forces of the actuators in turn, before their gear.
 
-        An orientation servo has three, every other actuator one; see `indexing.force_columns`.
+        Those of the last substep. An orientation servo has three, every other actuator one; see
+        `indexing.force_columns`.
         """
         return self._columns("actuator_force", self._forces)
 
