@@ -99,6 +99,17 @@ def test_joint_and_force_fields_agree_with_mujoco(world):
     check(data.qfrc_actuator, np.zeros((3, len(v))))
 
 
+def test_forces_of_wrenches_belong_to_one_moment(kit):
+    """Also where velocities are newer than accelerations, as in observations."""
+    sim, scene = kit.make(robot=kit.cfg(kit.ROBOT))
+    kit.randomize(sim)
+    sim.data.xfrc_applied.zero_()
+    sim.step()
+    sim.data.qvel.mul_(3.0)
+    sim.forward(stage="vel")
+    check(scene["robot"].data.qfrc_external, torch.zeros(3, 2).numpy())
+
+
 def test_frames_of_the_root(kit):
     sim, scene = kit.make(robot=kit.cfg(kit.ROBOT))
     references = kit.randomize(sim)

@@ -12,7 +12,14 @@ import torch
 from mjlab.actuator import BuiltinPositionActuatorCfg
 from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
 from mjlab.scene import Scene, SceneCfg
-from mjlab.sensor import BuiltinSensorCfg, ObjRef, Sensor, SensorCfg
+from mjlab.sensor import (
+    BuiltinSensorCfg,
+    ContactMatch,
+    ContactSensorCfg,
+    ObjRef,
+    Sensor,
+    SensorCfg,
+)
 from mjlab.sim import Simulation, SimulationCfg
 from mjlab.terrains import (
     HfWaveTerrainCfg,
@@ -236,6 +243,44 @@ def test_caches_are_dropped_by_forward_update_and_reset(kit):
         renew()
         assert sensor.data is not before
         torch.testing.assert_close(sensor.data[0, 2], before[0, 2] + 1.0)
+
+
+def test_only_sensors_of_forces_keep_their_data_when_velocities_are_computed(kit):
+    touch = ContactSensorCfg(name="touch", primary=ContactMatch("body", "box", entity="box"))
+
+    class Copy(Sensor[torch.Tensor]):
+        def initialize(self, mj_model, model, data, device):
+            self._sim_data = data
+
+        def _compute_data(self):
+            return self._sim_data.xpos[:, 1].clone()
+
+    class CopyCfg(SensorCfg):
+        def build(self):
+            return Copy()
+
+    sim, scene = kit.make(entities={"box": kit.cfg(kit.BOX)}, sensors=(CopyCfg(name="copy"), touch))
+    for stage, kept in (("pos", True), ("vel", True), ("acc", False)):
+        before = scene["copy"].data, scene["touch"].data
+        sim.forward(stage=stage)
+        assert scene["copy"].data is not before[0]
+        assert (scene["touch"].data is before[1]) == kept
+
+
+def test_environments_in_which_something_was_placed_are_known_until_the_next_substep(kit):
+    sim, scene = kit.make(num_envs=4, entities={"box": kit.cfg(kit.BOX)})
+    box = scene["box"]
+    assert scene.take_moved_envs() is None
+    pose = box.data.default_root_state[:, :7]
+    with torch.inference_mode():
+        box.write_root_link_pose_to_sim(pose[:1], env_ids=torch.tensor([1]))
+    box.write_root_link_pose_to_sim(pose[:1], env_ids=torch.tensor([False, False, False, True]))
+    box.write_root_link_velocity_to_sim(torch.zeros(4, 6))
+    assert scene.take_moved_envs().tolist() == [False, True, False, True]
+    assert scene.take_moved_envs() is None
+    box.write_root_link_pose_to_sim(pose)
+    scene.update(0.1)
+    assert scene.take_moved_envs() is None
 
 
 def test_only_what_acts_between_substeps_asks_for_them(kit):

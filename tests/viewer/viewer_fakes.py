@@ -64,9 +64,9 @@ class FakeSim:
     def sense(self) -> None:
         pass
 
-    def forward(self) -> None:
-        for data in self.datas:
-            mujoco.mj_forward(self.mj_model, data)
+    def forward(self, env_ids: torch.Tensor | None = None) -> None:
+        for i in range(len(self.datas)) if env_ids is None else env_ids.tolist():
+            mujoco.mj_forward(self.mj_model, self.datas[i])
 
     def copy_to_host(self, env_idx: int, mj_data: mujoco.MjData) -> None:
         spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)

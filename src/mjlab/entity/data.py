@@ -30,11 +30,13 @@ class EntityData(KinematicsReader, StateWriter):
 
     After `sim.step()` joint positions and velocities are current, and everything that MuJoCo
     derives from them (poses, velocities of links, forces, accelerations) belongs to the state
-    before the last substep, until `sim.forward()`.
+    before the last substep, until `sim.forward()`. In observations poses and velocities are
+    current; forces and accelerations are those of the last substep (`ManagerBasedRlEnv.step`).
     """
 
     _transient = {
         "indexing", "data", "model", "device", "_views", "gravity_vec_w", "forward_vec_b",
+        "moved_envs",
     }  # fmt: skip
 
     POS_DIM = 3
@@ -84,6 +86,9 @@ class EntityData(KinematicsReader, StateWriter):
     """(N, number of sites) commands for site actuators; (N, 0) without such actuators."""
     encoder_bias: torch.Tensor
     """(N, nj) added to joint positions in `joint_pos_biased`; kept over resets."""
+    moved_envs: torch.Tensor | None = None
+    """(N,) bool, where a pose or joint positions were written since the last substep; None for
+    nowhere."""
     _views: dict[Any, torch.Tensor] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -127,7 +132,7 @@ class EntityData(KinematicsReader, StateWriter):
 
     @property
     def joint_acc(self) -> torch.Tensor:
-        """(N, nj) joint accelerations."""
+        """(N, nj) joint accelerations, of the last substep."""
         return self._columns("qacc", self._joint_v)
 
     @property
@@ -152,29 +157,30 @@ class EntityData(KinematicsReader, StateWriter):
     def actuator_force(self) -> torch.Tensor:
         """(N, number of forces) forces of the actuators in turn, before their gear.
 
-        An orientation servo has three, every other actuator one; see `indexing.force_columns`.
+        Those of the last substep. An orientation servo has three, every other actuator one; see
+        `indexing.force_columns`.
         """
         return self._columns("actuator_force", self._forces)
 
     @property
     def qfrc_actuator(self) -> torch.Tensor:
-        """(N, nj) generalized forces of the actuators on the joints."""
+        """(N, nj) generalized forces of the actuators on the joints in the last substep."""
         return self._columns("qfrc_actuator", self._joint_v)
 
     @property
     def qfrc_external(self) -> torch.Tensor:
-        """(N, nj) generalized forces on the joints of wrenches applied to bodies.
+        """(N, nj) generalized forces on the joints of the wrenches now applied to bodies.
 
-        What remains of `qfrc_smooth` without actuators, applied and passive forces, and bias.
+        `sum_b S_j . (tau_b + (p_b - c) x f_b, f_b)` over the bodies b that joint axis j moves, with
+        its motion axis `S_j` (`cdof`) about c, the centre of mass of the tree.
         """
-        at = self._joint_v
-        return (
-            self._columns("qfrc_smooth", at)
-            - self._columns("qfrc_actuator", at)
-            - self._columns("qfrc_applied", at)
-            - self._columns("qfrc_passive", at)
-            + self._columns("qfrc_bias", at)
-        )
+        # Not `qfrc_smooth` without its other parts: those are of different stages of MuJoCo.
+        force, torque = self._columns("xfrc_applied", self._bodies).split(3, dim=-1)
+        arm = self._columns("xipos", self._bodies) - self._tree_com(self._body_trees)
+        wrench = torch.cat((torque + torch.linalg.cross(arm, force), force), dim=-1)
+        # A sum, because products of matrices may be rounded to TF32.
+        below = (self.indexing.moved_bodies[..., None] * wrench[:, None]).sum(dim=2)
+        return (self._columns("cdof", self._joint_v) * below).sum(dim=-1)
 
 
 __getattr__ = older_names(__name__)

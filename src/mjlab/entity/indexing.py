@@ -109,6 +109,8 @@ class EntityIndexing:
     """For each site, the body it belongs to."""
     site_tree_ids: torch.Tensor
     """For each site, the top-level body of its tree."""
+    moved_bodies: torch.Tensor
+    """(nj, number of bodies) float32, 1 where a degree of freedom of `joint_v_adr` moves a body."""
 
     def force_columns(
         self, actuator_ids: Sequence[int] | torch.Tensor | slice | int
@@ -164,6 +166,7 @@ def build_indexing(
     widths = [int(model.actuator_outnum[i]) for i in actuator_ids]
     stops = tuple(itertools.accumulate(widths))
     joints = [(int(model.jnt_type[i]), i) for i in ids["joints"]]
+    dofs = [model.jnt_dofadr[i] + k for kind, i in joints for k in range(dof_width(kind))]
     free = [] if free_joint is None else element_ids(model, "joints", (free_joint,))
     geom_bodies = [int(model.geom_bodyid[i]) for i in ids["geoms"]]
     site_bodies = [int(model.site_bodyid[i]) for i in ids["sites"]]
@@ -189,9 +192,7 @@ def build_indexing(
         joint_q_adr=tensor(
             model.jnt_qposadr[i] + k for kind, i in joints for k in range(qpos_width(kind))
         ),
-        joint_v_adr=tensor(
-            model.jnt_dofadr[i] + k for kind, i in joints for k in range(dof_width(kind))
-        ),
+        joint_v_adr=tensor(dofs),
         free_joint_q_adr=tensor(model.jnt_qposadr[i] + k for i in free for k in range(7)),
         free_joint_v_adr=tensor(model.jnt_dofadr[i] + k for i in free for k in range(6)),
         body_tree_ids=tensor(model.body_rootid[i] for i in ids["bodies"]),
@@ -199,9 +200,22 @@ def build_indexing(
         geom_tree_ids=tensor(model.body_rootid[i] for i in geom_bodies),
         site_body_ids=tensor(site_bodies),
         site_tree_ids=tensor(model.body_rootid[i] for i in site_bodies),
+        moved_bodies=_moved_bodies(model, dofs, ids["bodies"]).to(device),
         _root_id=root,
         _forces=tuple(range(stop - n, stop) for stop, n in zip(stops, widths, strict=True)),
     )
+
+
+def _moved_bodies(model: mujoco.MjModel, dofs: list[int], bodies: list[int]) -> torch.Tensor:
+    moves = torch.zeros(len(dofs), len(bodies))
+    for column, body in enumerate(bodies):
+        ancestors = set()
+        while body:
+            ancestors.add(body)
+            body = int(model.body_parentid[body])
+        for row, dof in enumerate(dofs):
+            moves[row, column] = int(model.dof_bodyid[dof]) in ancestors
+    return moves
 
 
 _OBJECT_TYPES = {

@@ -75,12 +75,17 @@ class StateWriter:
 
     Writes go straight to the simulation. What derives from the state (`body_link_pos_w`, velocities
     of links, sensors, ...) keeps its old values until the next `sim.forward()`.
+
+    Environments whose poses or joint positions were written are noted in `moved_envs`: forces of the
+    last substep do not belong to them any more, so `env.step` and `env.reset` compute these anew.
     """
 
     indexing: EntityIndexing
     data: Any
     model: Any
     device: str
+    default_root_state: torch.Tensor
+    moved_envs: torch.Tensor | None
     is_fixed_base: bool
     is_articulated: bool
     is_actuated: bool
@@ -107,6 +112,7 @@ class StateWriter:
         self._require_floating("write_root_pose")
         pose = as_values(pose, 7, "The root pose", self.device)
         assign(self.data.qpos, pose, env_ids, self._free_q)
+        self._note_move(env_ids)
 
     def write_root_velocity(self, velocity: torch.Tensor, env_ids: EnvIds = None) -> None:
         """Write the world velocity of the root link, (k, 6): linear (of its origin), angular.
@@ -169,6 +175,7 @@ class StateWriter:
         columns, width = self._joint_q.select(joint_ids)
         position = as_values(position, width, "The joint position", self.device, broadcasts=True)
         assign(self.data.qpos, position, env_ids, columns)
+        self._note_move(env_ids)
 
     def write_joint_velocity(
         self, velocity: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
@@ -235,6 +242,13 @@ class StateWriter:
         pose = as_values(pose, 7, "The mocap pose", self.device)
         assign(self.data.mocap_pos, pose[..., :3], env_ids, mocap_id)
         assign(self.data.mocap_quat, pose[..., 3:], env_ids, mocap_id)
+        self._note_move(env_ids)
+
+    def _note_move(self, env_ids: EnvIds) -> None:
+        moved = torch.zeros(len(self.default_root_state), dtype=torch.bool, device=self.device)
+        moved[slice(None) if env_ids is None else env_ids] = True
+        # A new tensor, because one that was made under `inference_mode` cannot be written outside.
+        self.moved_envs = moved if self.moved_envs is None else self.moved_envs | moved
 
     def _read_velocity(
         self, what: str, velocity: torch.Tensor, env_ids: EnvIds

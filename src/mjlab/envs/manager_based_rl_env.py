@@ -236,7 +236,9 @@ class ManagerBasedRlEnv:
         """Start new episodes in `env_ids` (None: all); return observations and extras.
 
         A `seed` reseeds every random number generator. Observations are those of all
-        environments; only those of `env_ids` advance their delay and history buffers.
+        environments; only those of `env_ids` advance their delay and history buffers. Forces and
+        accelerations are current in `env_ids`, and those of the last substep in the others, as
+        after `step`; before the first substep they are current everywhere.
 
         Raises:
             ValueError: `env_ids` out of range, not integers, or a mask of another length.
@@ -248,10 +250,11 @@ class ManagerBasedRlEnv:
         stepped = env_ids[self.episode_length_buf[env_ids] > 0]
         if len(stepped) > 0:
             self.recorder_manager.record_pre_reset(stepped)
+        moved = self.scene.take_moved_envs()
         self._reset_idx(env_ids)
         self.scene.write_data_to_sim(env_ids)
-        self.sim.forward()
-        self.command_manager.compute(dt=0.0, env_ids=env_ids)
+        self._forward(env_ids, moved)
+        self._compute_commands(dt=0.0, env_ids=env_ids)
         self.sim.sense()
         self.obs_buf = self.observation_manager.compute(update_history=True, env_ids=env_ids)
         self.recorder_manager.record_post_reset(env_ids)
@@ -261,10 +264,24 @@ class ManagerBasedRlEnv:
         """Advance all environments by one environment step.
 
         The order is: process actions; `decimation` physics substeps; terminations and rewards;
-        step and interval events; resets of environments that are done; one `forward`; commands;
-        observations. Terminations and rewards therefore read derived quantities (`xpos`, `cvel`,
-        `sensordata`, contacts) one physics substep old, while `qpos` and `qvel` are current;
-        commands and observations read everything current.
+        step and interval events; resets of environments that are done; `forward`; commands;
+        observations. On both engines:
+
+        - Terminations, rewards, metrics, step and interval events read what the last substep
+          computed: `qpos` and `qvel` are current, and derived quantities (`xpos`, `cvel`,
+          `sensordata`, contacts, forces) are those from which that substep started.
+        - Commands and observations read current positions and velocities and what derives from
+          them: poses and velocities of links, position and velocity sensors, rays, images.
+        - Quantities of the acceleration stage (contact and constraint forces, contact sensors,
+          `qacc`, `actuator_force`, accelerometers, force and torque sensors) stay those of the last
+          substep, which acted on the robot: `forward` goes no further than `stage="vel"`.
+        - A full `forward` gives them in environments that were reset, so that nothing of the old
+          episode is seen, and in those in which an event placed something (root pose, joint
+          positions or mocap pose, by a writer of `Entity`). Contact histories and air times begin
+          with the first substep after a reset.
+
+        A command that writes positions runs `sim.forward(env_ids)` itself, on the environments
+        concerned.
 
         Args:
             action: (N, A) float tensor; an array or a list is converted.
@@ -297,9 +314,10 @@ class ManagerBasedRlEnv:
             if mode in self.event_manager.available_modes:
                 self.event_manager.apply(mode=mode, dt=self.step_dt)
 
+        moved = self.scene.take_moved_envs()
         reset_ids = self._reset_done_envs()
-        self.sim.forward()
-        self.command_manager.compute(dt=self._command_dt(reset_ids))
+        self._forward(reset_ids, moved)
+        self._compute_commands(dt=self._command_dt(reset_ids))
         self.sim.sense()
         self.obs_buf = self.observation_manager.compute(update_history=True)
         if self.cfg.auto_reset:
@@ -366,6 +384,32 @@ class ManagerBasedRlEnv:
             self._reset_idx(reset_ids)
             self.scene.write_data_to_sim(reset_ids)
         return reset_ids
+
+    def _forward(self, reset_ids: torch.Tensor, moved: torch.Tensor | None) -> None:
+        """Make derived quantities current as far as `step` says.
+
+        Args:
+            reset_ids: Environments that were reset.
+            moved: (N,) bool, those in which something was placed before the resets (what resets
+                place is in `reset_ids`, and looking would wait for the GPU); None for nowhere.
+        """
+        full = reset_ids
+        if moved is not None:
+            full = moved.index_fill(0, reset_ids, True).nonzero().flatten()
+        # Before the first substep there is nothing to keep.
+        if len(full) == self.num_envs or self._sim_step_counter == 0:
+            self.sim.forward()
+            return
+        self.sim.forward(stage="vel")
+        if len(full) > 0:
+            self.sim.forward(full)
+
+    def _compute_commands(
+        self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None
+    ) -> None:
+        self.command_manager.compute(dt=dt, env_ids=env_ids)
+        # What resets placed is current by now, and commands see to what they place by themselves.
+        self.scene.take_moved_envs()
 
     def _command_dt(self, reset_ids: torch.Tensor) -> float | torch.Tensor:
         """Return the time that passed for commands: none where an episode has just begun."""

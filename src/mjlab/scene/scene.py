@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import mujoco
 import torch
@@ -31,6 +31,7 @@ from mjlab.sensor import (
     SensorCfg,
     SensorContext,
 )
+from mjlab.sim.engine import Stage
 from mjlab.terrains.terrain_entity import TerrainEntity, TerrainEntityCfg
 from mjlab.utils.spec import compile_composed, export_spec, make_asset_paths_absolute
 from mjlab.utils.state import stateful
@@ -67,7 +68,7 @@ class SceneCfg:
 class Scene:
     """What is in the world. Built from its config, then tied to a simulation by `initialize`."""
 
-    _transient = {"_env_origins", "_device", "_updated_sensors"}
+    _transient = {"_env_origins", "_device", "_updated_sensors", "_sensors_by_stage"}
 
     def __init__(self, scene_cfg: SceneCfg, device: str) -> None:
         """Compose the spec: terrain, entities, sensors, then the config's own edits.
@@ -157,6 +158,15 @@ class Scene:
         self._updated_sensors = [
             sensor for sensor in self._sensors.values() if type(sensor) is not BuiltinSensor
         ]
+        stages = get_args(Stage)
+        self._sensors_by_stage = {
+            stage: [
+                sensor
+                for sensor in self._updated_sensors
+                if stages.index(sensor.earliest_stage) <= index
+            ]
+            for index, stage in enumerate(stages)
+        }
 
     # Access.
 
@@ -297,6 +307,7 @@ class Scene:
         """
         for entity in self._entities.values():
             entity.update(substeps * dt)
+            entity.data.moved_envs = None
         for sensor in self._updated_sensors:
             if recorded is not None and sensor.recorded_fields:
                 sensor.update_recorded(recorded, dt)
@@ -308,9 +319,21 @@ class Scene:
         for entity in self._entities.values():
             entity.write_data_to_sim(env_ids)
 
-    def invalidate_sensor_caches(self) -> None:
-        """Have all sensors compute their data anew: derived quantities have changed."""
-        for sensor in self._updated_sensors:
+    def take_moved_envs(self) -> torch.Tensor | None:
+        """Return the environments in which something was placed since the last substep, (N,) bool.
+
+        They are forgotten then. None if nothing was: see `EntityData.moved_envs`.
+        """
+        moved = None
+        for entity in self._entities.values():
+            envs, entity.data.moved_envs = entity.data.moved_envs, None
+            if envs is not None:
+                moved = envs if moved is None else moved | envs
+        return moved
+
+    def invalidate_sensor_caches(self, stage: Stage = "acc") -> None:
+        """Drop the data of sensors that a forward pass up to `stage` has changed."""
+        for sensor in self._sensors_by_stage[stage]:
             sensor.invalidate_cache()
 
     # Files.

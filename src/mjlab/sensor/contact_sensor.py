@@ -181,8 +181,12 @@ class ContactSensor(Sensor[ContactData]):
     For every primary it adds one MuJoCo sensor `<sensor>_<primary>`, which measures all fields: one
     for each field would cost both engines as much again. They lie side by side in `sensordata`, so
     that all reading and recording is of one block.
+
+    Contacts are those of the last substep, in observations too; after a reset they are those of the
+    new state, while history and air times are empty.
     """
 
+    earliest_stage = "acc"
     _transient = {"_primary_names", "_layout", "_fields", "_records", "_source"}
 
     def __init__(self, cfg: ContactSensorCfg) -> None:

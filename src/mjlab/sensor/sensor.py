@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
 
 import torch
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import mujoco
 
     from mjlab.entity import Entity
+    from mjlab.sim.engine import Stage
     from mjlab.viewer.debug_visualizer import DebugVisualizer
 
 T = TypeVar("T")
@@ -41,9 +42,9 @@ class Sensor(ABC, Generic[T]):
     """Reads something from the simulation, in all environments.
 
     `data` is computed when it is first read, and kept until time passes (`update`), the
-    environment is reset (`reset`), or derived quantities are computed anew (`sim.forward()`, after
-    which the scene calls `invalidate_cache`). So it always belongs to the same state as the
-    simulation's derived fields.
+    environment is reset (`reset`), or `sim.forward` computes the fields that it is made of anew
+    (the scene then calls `invalidate_cache`). So it always belongs to the same state as these
+    fields of the simulation.
 
     A subclass computes its data in `_compute_data`. One that overrides `update`, because it keeps
     a history, is updated at every physics substep. If all it needs of a substep is data fields, it
@@ -52,6 +53,10 @@ class Sensor(ABC, Generic[T]):
     """
 
     _transient = {"_cached_data", "_cache_valid"}
+
+    earliest_stage: ClassVar[Stage] = "pos"
+    """Earliest stage of a forward pass that changes the data. `"acc"`: the data is made of
+    `sensordata` of the acceleration stage only, and outlasts `sim.forward(stage="vel")`."""
 
     def __init__(self) -> None:
         self._cached_data: T | None = None

@@ -136,7 +136,8 @@ class Simulation:
 
     After `step`, `qpos`, `qvel`, `act` and `time` are current, and every derived field (`xpos`,
     `cvel`, `sensordata`, ...) belongs to the state before the last physics substep. After
-    `forward` all are current.
+    `forward` all are current up to its stage; with `stage="vel"`, forces, accelerations and their
+    sensors remain those of that substep.
     """
 
     def __init__(
@@ -185,7 +186,7 @@ class Simulation:
         self._expanded: set[str] = set()
         if variant_info:
             self._apply_variants(variant_info)
-        self._forward_callbacks: list[Callable[[], None]] = []
+        self._forward_callbacks: list[Callable[[Stage], None]] = []
         self._sensor_context: Any = None
         self.nan_guard = NanGuard(
             cfg.nan_guard,
@@ -419,7 +420,7 @@ class Simulation:
         """
         self._engine.forward(self.resolve_ids(env_ids), stage)
         for callback in self._forward_callbacks:
-            callback()
+            callback(stage)
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Put environments into the model's initial state: time 0, `qpos0`, the rest zero.
@@ -428,8 +429,8 @@ class Simulation:
         """
         self._engine.reset(self.resolve_ids(env_ids))
 
-    def add_forward_callback(self, callback: Callable[[], None]) -> None:
-        """Call `callback` after every `forward`: what was cached from derived fields is stale."""
+    def add_forward_callback(self, callback: Callable[[Stage], None]) -> None:
+        """Call `callback(stage)` after every `forward`: derived fields up to a stage have changed."""
         self._forward_callbacks.append(callback)
 
     def sense(self) -> None:
@@ -524,7 +525,7 @@ class Simulation:
         self.expand_model_fields(tuple(state["model"]))
         self._engine.load_state_dict(state)
         for callback in self._forward_callbacks:
-            callback()
+            callback("acc")
 
     def close(self) -> None:
         """Free what the engine holds outside Python's reach."""

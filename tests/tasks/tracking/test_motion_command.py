@@ -270,7 +270,12 @@ def test_only_robots_that_were_teleported_are_computed_anew(make_env, short, mon
     env.reset()
     calls = []
     forward = env.sim.forward
-    monkeypatch.setattr(env.sim, "forward", lambda ids=None: calls.append(ids) or forward(ids))
+
+    def count(ids=None, stage="acc"):
+        calls.append(ids)
+        forward(ids, stage)
+
+    monkeypatch.setattr(env.sim, "forward", count)
     for _ in range(4):
         idle(env)
     some = [ids.tolist() for ids in calls if ids is not None]

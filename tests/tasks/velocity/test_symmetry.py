@@ -99,7 +99,7 @@ def test_the_mirror_image_is_what_a_mirrored_robot_senses(task):
     assert env.action_manager.get_term("joint_pos").target_names == names
     # In the air, and falling onto the ground for some steps.
     differs = set()
-    for height, steps in ((0.6, 1), (FALLING[task], 4), (FALLING[task], 5)):
+    for height, steps in ((0.6, 1), (FALLING[task], 3), (FALLING[task], 5)):
         put_before_mirror(env, height)
         action = mirrored_rows(env, 0.3 * torch.randn(1, len(names)))
         for _ in range(steps):

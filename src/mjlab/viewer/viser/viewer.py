@@ -209,12 +209,11 @@ class ViserPlayViewer(BaseViewer):
         return False
 
     def _bind_drawn_fields(self) -> None:
-        """Have the engine provide what the scene reads; it is zero until the next forward."""
+        """Have the engine provide what the scene reads."""
         sim = self.env.unwrapped.sim
         for name in ("xpos", "xmat", "mocap_pos", "mocap_quat"):
             if not name.startswith("mocap") or sim.mj_model.nmocap > 0:
                 getattr(sim.data, name)
-        sim.forward()
 
     def _create_gui(self) -> None:
         gui, scene = self._server.gui, self.scene
@@ -302,7 +301,7 @@ class ViserPlayViewer(BaseViewer):
         with torch.no_grad():
             env.reset(env_ids=ids)
             if env.command_manager.apply_gui_reset(ids):
-                env.sim.forward()
+                env.sim.forward(ids)
                 env.sim.sense()
                 # What the reset observed is of the state before.
                 env.observation_manager.reset(ids)

@@ -386,6 +386,6 @@ class MotionCommand(MotionReader, CommandTerm):
         self.reset_to_frame(env_ids, frame)
         last = self.motion.lengths[self.motion_ids[env_ids]] - 1
         self.time_steps[env_ids] = (self.time_steps[env_ids] + 1).minimum(last)
-        self._env.sim.forward()
+        self._env.sim.forward(env_ids)
         self.update_relative_body_poses()
         return True
