@@ -54,6 +54,14 @@ def test_poses_and_velocities_of_bodies_agree_with_mujoco(world):
             np.testing.assert_allclose(matrix, reference.ximat[i], atol=1e-4)
 
 
+@pytest.mark.parametrize("chosen", [slice(1, None), torch.tensor([-1, 0])])
+def test_velocities_of_some_links_are_those_of_all_that_are_chosen(world, chosen):
+    data = world[2].data
+    for one in ("lin", "ang"):
+        some = getattr(data, f"link_{one}_vel_of")(chosen)
+        torch.testing.assert_close(some, getattr(data, f"body_link_{one}_vel_w")[:, chosen])
+
+
 def test_geoms_and_sites_agree_with_mujoco(world):
     model, references, entity = world
     data = entity.data

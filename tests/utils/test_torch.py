@@ -1,4 +1,4 @@
-"""Settings of torch."""
+"""Settings of torch, and constants."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from mjlab.utils.torch import configure_torch_backends, prepare_torch
+from mjlab.utils.torch import configure_torch_backends, constant_tensor, prepare_torch
 
 backends: Any = torch.backends
 
@@ -42,3 +42,14 @@ def test_a_process_has_its_own_gpu_as_the_current_one(monkeypatch):
     prepare_torch("cuda:1")
     assert chosen == [torch.device("cuda:1")]
     assert backends.cuda.matmul.fp32_precision == "tf32"
+
+
+def test_constants_are_made_once_and_serve_gradients_too():
+    with torch.inference_mode():
+        made = constant_tensor((1.0, 2.0), "cpu")
+    assert constant_tensor((1.0, 2.0), "cpu") is made
+    assert constant_tensor((1.0, 3.0), "cpu").tolist() == [1.0, 3.0]
+    weight = torch.ones(2, requires_grad=True)
+    (weight * made).sum().backward()
+    assert weight.grad is not None
+    assert weight.grad.tolist() == [1.0, 2.0]

@@ -97,6 +97,8 @@ class EntityData(KinematicsReader, StateWriter):
     def clear_state(self, env_ids: EnvIds = None) -> None:
         """Set all targets to zero."""
         for target in self._targets():
+            if target.shape[1] == 0:
+                continue
             if env_ids is None:
                 target.zero_()
             else:

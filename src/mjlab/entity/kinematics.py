@@ -264,6 +264,23 @@ class KinematicsReader:
         """(N, nb, 6) velocities of the bodies' centres of mass."""
         return torch.cat((self.body_com_lin_vel_w, self.body_com_ang_vel_w), dim=-1)
 
+    def link_lin_vel_of(self, bodies: slice | torch.Tensor) -> torch.Tensor:
+        """Return linear velocities of the origins of links `bodies` of the entity, (N, n, 3).
+
+        This is faster than choosing from `body_link_lin_vel_w`, which computes those of all links.
+        """
+        ids = self._bodies.tensor[bodies]
+        if self._body_trees.constant == self.indexing.root_body_id:
+            com = self._columns("subtree_com", self._root)
+        else:
+            com = self.data.subtree_com.index_select(1, self._body_trees.tensor[bodies])
+        pos, cvel = (field.index_select(1, ids) for field in (self.data.xpos, self.data.cvel))
+        return _linear_velocity(pos, com, cvel)
+
+    def link_ang_vel_of(self, bodies: slice | torch.Tensor) -> torch.Tensor:
+        """Return angular velocities of links `bodies` of the entity, (N, n, 3)."""
+        return self.data.cvel.index_select(1, self._bodies.tensor[bodies])[..., :3]
+
     def _body_linear(self, position: str) -> torch.Tensor:
         return _linear_velocity(
             self._columns(position, self._bodies),

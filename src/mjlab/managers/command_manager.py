@@ -101,17 +101,21 @@ class CommandTerm(ManagerTermBase):
     def reset(self, env_ids: torch.Tensor | slice | None) -> dict[str, Any]:
         """Draw new commands in these environments, and return and zero the mean of each metric.
 
-        Environments where a metric is NaN or infinite are left out of its mean.
+        Environments that `_is_measured` excludes are left out of the means, and those where a
+        metric is NaN or infinite of its mean.
         """
         ids = as_ids(env_ids, self.num_envs, self.device)
         if is_empty(ids):
             return {}
         log: dict[str, Any] = {}
         if self.metrics:
-            means = torch.stack([finite_mean(v[ids].float()) for v in self.metrics.values()])
-            log = dict(zip(self.metrics, means.unbind(), strict=True))
-            for values in self.metrics.values():
-                values[ids] = 0.0
+            values = torch.stack([metric[ids].float() for metric in self.metrics.values()])
+            is_measured = self._is_measured(ids)
+            if is_measured is not None:
+                values.masked_fill_(~is_measured, torch.nan)
+            log = dict(zip(self.metrics, finite_mean(values).unbind(), strict=True))
+            for metric in self.metrics.values():
+                metric[ids] = 0.0
         self.command_counter[ids] = 0
         self._resample(ids)
         return log
@@ -163,6 +167,10 @@ class CommandTerm(ManagerTermBase):
 
     def _update_metrics(self) -> None:
         """Update the tensors in `self.metrics`."""
+
+    def _is_measured(self, env_ids: torch.Tensor) -> torch.Tensor | None:
+        """Return which of these environments have metrics to log, (n,) bool; None: all."""
+        return None
 
     def _debug_vis_impl(self, visualizer: DebugVisualizer) -> None:
         """Draw the command."""

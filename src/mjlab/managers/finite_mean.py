@@ -11,5 +11,6 @@ def finite_mean(values: torch.Tensor) -> torch.Tensor:
     Args:
         values: Float tensor (..., E) with one value for each of E environments.
     """
-    finite = torch.isfinite(values)
+    # `isfinite` takes twice the operations.
+    finite = values.abs() < torch.inf
     return torch.where(finite, values, 0.0).sum(dim=-1) / finite.sum(dim=-1).clamp(min=1)

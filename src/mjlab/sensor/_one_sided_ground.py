@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import mujoco
@@ -14,6 +15,9 @@ _HFIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
 _MOST_CELLS = 512
 # Single precision may put a point beyond the edge that it is on (m).
 _EDGE = 1e-3
+
+# Planes that are tested one after the other.
+_FEW = 4
 
 
 class OneSidedGround:
@@ -64,6 +68,10 @@ class OneSidedGround:
         # Planes among height fields read elevations too, which then count for nothing.
         self._has_fields = bool(is_field.any())
         self._heights = _tensor(m.hfield_data, device)
+        is_still = not (self._has_fields or self._is_placed_by_env or self._is_turned)
+        self.is_level = is_still and len(geoms) <= _FEW
+        """True for a few level planes that stand still; see `is_above_level`."""
+        self._level_planes = list(zip(self._pos.tolist(), self._extent.tolist(), strict=True))
         self._make_grid(host.geom_xpos[geoms], host.geom_xmat[geoms], extent, carried, device)
 
     def _make_grid(
@@ -130,6 +138,17 @@ class OneSidedGround:
             local = (mat * local[..., :, None]).sum(dim=-2)
         inside = (local[..., :2].abs() <= self._extent[geoms]).all(dim=-1) & (found >= 0)
         return (inside & (local[..., 2] < self._surface(local, geoms))).any(dim=-1)
+
+    def is_above_level(self, points: torch.Tensor) -> torch.Tensor:
+        """Return the same for ground that `is_level`, plane by plane: faster than a search."""
+        result = torch.zeros_like(points[:, 0], dtype=torch.bool)
+        for position, extent in self._level_planes:
+            below = points[:, 2] < position[2]
+            for axis in range(2):
+                if extent[axis] < math.inf:
+                    below &= (points[:, axis] - position[axis]).abs() <= extent[axis]
+            result |= below
+        return result
 
     def _surface(self, local: torch.Tensor, geoms: torch.Tensor) -> torch.Tensor:
         """Return the height of surfaces `geoms` (...,) at local positions (..., 3), in their frames.

@@ -85,6 +85,9 @@ class TerrainHeightSensor(RayCastSensor):
         heights = torch.where(missed, self.cfg.max_distance, heights)
         if len(self._ground) == 0:
             return heights
+        if self._ground.is_level:
+            below = self._ground.is_above_level(self._origins.flatten(0, 1)).view_as(missed)
+            return torch.where(missed & below, 0.0, heights)
         if heights.device.type == "cpu":
             # Few rays miss, and asking whether any did costs nothing here. On a GPU it would wait.
             rows, columns = missed.nonzero(as_tuple=True)

@@ -1,7 +1,8 @@
-"""Settings of torch that hold for the whole process."""
+"""Settings of torch that hold for the whole process, and tensors that do."""
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import torch
@@ -34,3 +35,18 @@ def configure_torch_backends(allow_tf32: bool = True, deterministic: bool = Fals
         torch.backends.cudnn.allow_tf32 = allow_tf32
     torch.backends.cudnn.deterministic = deterministic
     torch.backends.cudnn.benchmark = not deterministic
+
+
+@functools.lru_cache(maxsize=1024)
+def constant_tensor(
+    values: tuple[Any, ...],
+    device: torch.device | str,
+    dtype: torch.dtype = torch.float32,
+) -> torch.Tensor:
+    """Return a tensor of (nested tuples of) numbers; every call returns the same one, to be read only.
+
+    For numbers of configs: a step copies nothing to the device, and edited configs are seen.
+    """
+    # An inference tensor could not take part in later computations with gradients.
+    with torch.inference_mode(False):
+        return torch.tensor(values, dtype=dtype, device=device)

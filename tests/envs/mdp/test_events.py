@@ -107,6 +107,18 @@ def test_the_default_state_includes_the_origin(world: Any) -> None:
     torch.testing.assert_close(root_velocity(world, slice(1, 3)), expected)
 
 
+def test_ranges_may_change_between_resets(world: Any) -> None:
+    ids = torch.tensor([1])
+    ranges: dict[str, tuple[float, float]] = {}
+    events.reset_root_state_uniform(world, ids, ranges)
+    start = world.sim.data.qpos[1, :3].clone()
+    for x in (0.25, 0.5):
+        ranges["x"] = (x, x)
+        events.reset_root_state_uniform(world, ids, ranges)
+        moved = world.sim.data.qpos[1, :3] - start
+        torch.testing.assert_close(moved, torch.tensor([x, 0.0, 0.0]))
+
+
 def test_uniform_root_state_turns_about_the_bodys_axes(world: Any) -> None:
     pose: Any = {"x": (0.5, 0.5), "roll": (0.3, 0.3), "yaw": [0.7, 0.7]}
     velocity = {"z": (1.0, 1.0), "yaw": (2.0, 2.0)}

@@ -93,6 +93,12 @@ def test_euler_angles_agree_with_scipy(seed):
         assert_close(m.matrix_from_euler(angles, convention), expected)
 
 
+def test_euler_angles_broadcast():
+    yaw = torch.linspace(-1.0, 1.0, 5)
+    expected = m.quat_from_euler_xyz(torch.full((5,), 0.1), torch.zeros(5), yaw)
+    assert_close(m.quat_from_euler_xyz(torch.tensor(0.1), torch.zeros(1), yaw), expected)
+
+
 def test_euler_angles_can_be_wrapped_and_the_pole_is_finite():
     quat = m.quat_from_euler_xyz(*torch.tensor([[-0.1], [-0.2], [-0.3]]))
     wrapped = torch.cat(m.euler_xyz_from_quat(quat, wrap_to_2pi=True))

@@ -117,3 +117,13 @@ def test_random_transformations():
     assert shifts.min() < 0 < shifts.max()
     small = m.quat_from_matrix(m.generate_random_rotation(rot_boundary=0.01))
     assert m.axis_angle_from_quat(small).norm() < 0.02
+
+
+def test_each_column_is_drawn_from_its_own_range():
+    ranges = [(0.0, 1.0), (5.0, 5.0), (-3.0, -2.0)]
+    drawn = m.sample_ranges(ranges, (50, 4), "cpu")
+    assert drawn.shape == (50, 4, 3)
+    for column, (low, high) in zip(drawn.flatten(0, 1).T, ranges, strict=True):
+        assert low <= column.min()
+        assert column.max() <= high
+    assert m.sample_ranges([(2.0, 2.0)], 3, "cpu").tolist() == [[2.0], [2.0], [2.0]]

@@ -20,6 +20,7 @@ from mjlab.utils.lab_api.math import (
     quat_apply_inverse,
     quat_from_euler_xyz,
     quat_mul,
+    sample_ranges,
     sample_uniform,
 )
 
@@ -213,10 +214,8 @@ def _sample_se3_range(
     unknown = [key for key in ranges if key not in _SE3_KEYS]
     if unknown:
         raise ValueError(f"Ranges have unknown keys {unknown}; the keys are {list(_SE3_KEYS)}.")
-    bounds = torch.tensor(
-        [ranges.get(key, (0.0, 0.0)) for key in _SE3_KEYS], dtype=torch.float32, device=device
-    )
-    return sample_uniform(bounds[:, 0], bounds[:, 1], shape, device)
+    bounds = [ranges.get(key, (0.0, 0.0)) for key in _SE3_KEYS]
+    return sample_ranges(bounds, shape[:-1], device)
 
 
 def _write_root(

@@ -79,9 +79,9 @@ def quat_from_matrix(matrix: torch.Tensor) -> torch.Tensor:
 
 def quat_from_euler_xyz(roll: torch.Tensor, pitch: torch.Tensor, yaw: torch.Tensor) -> torch.Tensor:
     """Return the quaternions (..., 4) of Rz(yaw) Ry(pitch) Rx(roll); angles (...) in rad."""
-    cr, sr = torch.cos(0.5 * roll), torch.sin(0.5 * roll)
-    cp, sp = torch.cos(0.5 * pitch), torch.sin(0.5 * pitch)
-    cy, sy = torch.cos(0.5 * yaw), torch.sin(0.5 * yaw)
+    half = 0.5 * torch.stack(torch.broadcast_tensors(roll, pitch, yaw))
+    cr, cp, cy = torch.cos(half)
+    sr, sp, sy = torch.sin(half)
     return torch.stack(
         (
             cy * cp * cr + sy * sp * sr,

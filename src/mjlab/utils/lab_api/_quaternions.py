@@ -29,7 +29,9 @@ def quat_mul(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
 
 def quat_conjugate(q: torch.Tensor) -> torch.Tensor:
     """Return (w, -x, -y, -z)."""
-    return torch.cat((q[..., :1], -q[..., 1:]), dim=-1)
+    conjugate = -q
+    conjugate[..., 0] = q[..., 0]
+    return conjugate
 
 
 def quat_inv(q: torch.Tensor, eps: float = 1e-9) -> torch.Tensor:
@@ -51,14 +53,12 @@ def quat_apply(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
 
     Returns a tensor of the shape of `vec`. Raises `ValueError` if sizes do not fit.
     """
-    quat = _fit_to(quat, vec)
-    return _rotate(quat[..., :1], quat[..., 1:], vec)
+    return _rotate(_fit_to(quat, vec), vec, sign=1.0)
 
 
 def quat_apply_inverse(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
     """Rotate vectors back: R(q)' v. Arguments and errors are those of `quat_apply`."""
-    quat = _fit_to(quat, vec)
-    return _rotate(quat[..., :1], -quat[..., 1:], vec)
+    return _rotate(_fit_to(quat, vec), vec, sign=-1.0)
 
 
 quat_rotate = quat_apply
@@ -150,9 +150,12 @@ def quat_slerp(q1: torch.Tensor, q2: torch.Tensor, tau: float) -> torch.Tensor:
     return (torch.sin((1.0 - tau) * angle) * q1 + torch.sin(tau * angle) * target) / sine
 
 
-def _rotate(w: torch.Tensor, xyz: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
-    twice = 2.0 * torch.linalg.cross(xyz, vec)
-    return vec + w * twice + torch.linalg.cross(xyz, twice)
+def _rotate(quat: torch.Tensor, vec: torch.Tensor, sign: float) -> torch.Tensor:
+    """Return v + 2 (s w c + xyz x c) with c = xyz x v; `sign` s is -1 for the inverse rotation."""
+    w, xyz = quat[..., :1], quat[..., 1:]
+    cross = torch.linalg.cross(xyz, vec)
+    change = torch.linalg.cross(xyz, cross).addcmul_(w, cross, value=sign)
+    return torch.add(vec, change, alpha=2.0)
 
 
 def _fit_to(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:

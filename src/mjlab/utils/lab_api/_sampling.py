@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 
 from mjlab.utils.lab_api._basics import normalize
 from mjlab.utils.lab_api._conversions import quat_from_euler_xyz
+from mjlab.utils.torch import constant_tensor
 
 Size = int | tuple[int, ...]
 
@@ -15,6 +18,14 @@ def sample_uniform(
 ) -> torch.Tensor:
     """Return numbers uniform in [lower, upper). The bounds may be tensors that broadcast."""
     return torch.rand(_shape(size), dtype=torch.float32, device=device) * (upper - lower) + lower
+
+
+def sample_ranges(ranges: Iterable[tuple[float, float]], size: Size, device: str) -> torch.Tensor:
+    """Return numbers (*size, n), those of column i uniform in the i-th of n ranges [low, high)."""
+    low, high = (
+        constant_tensor(tuple(map(float, side)), device) for side in zip(*ranges, strict=True)
+    )
+    return sample_uniform(low, high, (*_shape(size), len(low)), device)
 
 
 def sample_log_uniform(

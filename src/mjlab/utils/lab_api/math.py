@@ -75,6 +75,7 @@ from mjlab.utils.lab_api._sampling import (
     sample_cylinder,
     sample_gaussian,
     sample_log_uniform,
+    sample_ranges,
     sample_triangle,
     sample_uniform,
 )
@@ -127,6 +128,7 @@ __all__ = [
     "sample_cylinder",
     "sample_gaussian",
     "sample_log_uniform",
+    "sample_ranges",
     "sample_triangle",
     "sample_uniform",
     "saturate",

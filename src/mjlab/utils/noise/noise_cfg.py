@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
@@ -10,6 +9,7 @@ from typing import Any, ClassVar, Literal
 import torch
 
 from mjlab.utils.noise.noise_model import NoiseModel, NoiseModelWithAdditiveBias
+from mjlab.utils.torch import constant_tensor
 
 NoiseParam = float | tuple[float, ...]
 """One value, or one for each entry of the last axis of the data."""
@@ -140,15 +140,7 @@ def _param(value: Any, data: torch.Tensor) -> Any:
         return value
     if isinstance(value, torch.Tensor):
         return value.to(data)
-    return _tensor_of(tuple(value), data.dtype, data.device)
-
-
-@functools.lru_cache(maxsize=256)
-def _tensor_of(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-    # Cached by value, so that a step copies nothing to the device and edited configs are seen.
-    # An inference tensor could not take part in later computations with gradients.
-    with torch.inference_mode(False):
-        return torch.tensor(values, dtype=dtype, device=device)
+    return constant_tensor(tuple(value), data.device, data.dtype)
 
 
 def _in_order(low: Any, high: Any) -> bool:

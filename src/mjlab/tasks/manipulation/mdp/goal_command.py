@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
-from mjlab.managers.env_ids import as_ids, is_empty
 from mjlab.tasks.manipulation.mdp.goal_panel import GoalPanel
+from mjlab.utils.lab_api.math import sample_ranges
 
 if TYPE_CHECKING:
     import viser
@@ -130,19 +130,6 @@ class GoalCommand(CommandTerm):
                 # What a person holds is not taken away.
                 self.time_left[held] = self.cfg.resampling_time_range[1]
 
-    def reset(self, env_ids: torch.Tensor | slice | None) -> dict[str, float]:
-        """Draw goals and place objects in these environments; return the means of the metrics.
-
-        Environments that never had a goal are left out of the means.
-        """
-        ids = as_ids(env_ids, self.num_envs, self.device)
-        if is_empty(ids):
-            return {}
-        had_none = self.command_counter[ids] == 0
-        for values in self.metrics.values():
-            values[ids] = values[ids].masked_fill_(had_none, torch.nan)
-        return super().reset(ids)
-
     def create_gui(
         self,
         name: str,
@@ -177,7 +164,7 @@ class GoalCommand(CommandTerm):
                 count, 3
             )
         within = self.cfg.target_position_range
-        return uniform_in(count, within.x, within.y, within.z, device=self.device)
+        return sample_ranges((within.x, within.y, within.z), count, self.device)
 
     def _place_objects(self, env_ids: torch.Tensor) -> None:
         """Put the objects of these environments to where they start, with `_place`."""
@@ -198,6 +185,10 @@ class GoalCommand(CommandTerm):
 
     # Metrics and drawing.
 
+    def _is_measured(self, env_ids: torch.Tensor) -> torch.Tensor:
+        # Before its first goal there was nothing to measure.
+        return self.command_counter[env_ids] > 0
+
     def _update_metrics(self) -> None:
         metrics = self.metrics
         error = torch.linalg.vector_norm(self.target_pos - self.wanted_object_pos(), dim=1)
@@ -214,11 +205,3 @@ class GoalCommand(CommandTerm):
         for index in visualizer.get_env_indices(self.num_envs):
             goal = self.target_pos[index].cpu().numpy()
             visualizer.add_sphere(goal, _GOAL_RADIUS, self._goal_color)
-
-
-def uniform_in(count: int, *ranges: tuple[float, float], device: str) -> torch.Tensor:
-    """Return `count` rows of numbers, the i-th of each uniform within the i-th range."""
-    drawn = torch.rand(count, len(ranges), dtype=torch.float32, device=device)
-    for column, (low, high) in zip(drawn.unbind(dim=1), ranges, strict=True):
-        column.mul_(high - low).add_(low)
-    return drawn

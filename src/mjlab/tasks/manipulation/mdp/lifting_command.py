@@ -13,11 +13,8 @@ from mjlab.tasks.manipulation.mdp.goal_checks import (
     check_pose_range,
     require_object,
 )
-from mjlab.tasks.manipulation.mdp.goal_command import (
-    GoalCommand,
-    GoalCommandCfg,
-    uniform_in,
-)
+from mjlab.tasks.manipulation.mdp.goal_command import GoalCommand, GoalCommandCfg
+from mjlab.utils.lab_api.math import sample_ranges
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -89,8 +86,8 @@ class LiftingCommand(GoalCommand):
         if within is None:
             return
         count = len(env_ids)
-        positions = uniform_in(count, within.x, within.y, within.z, device=self.device)
-        yaws = uniform_in(count, within.yaw, device=self.device).squeeze(1)
+        positions = sample_ranges((within.x, within.y, within.z), count, self.device)
+        yaws = sample_ranges((within.yaw,), count, self.device).squeeze(1)
         self._place(self.object, positions, yaws, env_ids)
 
     def _update_metrics(self) -> None:

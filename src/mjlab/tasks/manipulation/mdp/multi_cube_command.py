@@ -13,12 +13,9 @@ from mjlab.tasks.manipulation.mdp.goal_checks import (
     check_pose_range,
     require_object,
 )
-from mjlab.tasks.manipulation.mdp.goal_command import (
-    GoalCommand,
-    GoalCommandCfg,
-    uniform_in,
-)
+from mjlab.tasks.manipulation.mdp.goal_command import GoalCommand, GoalCommandCfg
 from mjlab.tasks.manipulation.mdp.placement import distance_apart, keep_apart
+from mjlab.utils.lab_api.math import sample_ranges
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -111,8 +108,8 @@ class MultiCubeLiftingCommand(GoalCommand):
         count = len(env_ids)
         positions, yaws = [], []
         for _ in self.objects:
-            positions.append(uniform_in(count, within.x, within.y, within.z, device=self.device))
-            yaws.append(uniform_in(count, within.yaw, device=self.device).squeeze(1))
+            positions.append(sample_ranges((within.x, within.y, within.z), count, self.device))
+            yaws.append(sample_ranges((within.yaw,), count, self.device).squeeze(1))
         placed = torch.stack(positions, dim=1)
         keep_apart(placed, self._apart[env_ids], within.x, within.y)
         for index, entity in enumerate(self.objects):

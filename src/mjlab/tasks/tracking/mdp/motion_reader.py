@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -46,32 +46,33 @@ class MotionReader:
     @property
     def joint_pos(self) -> torch.Tensor:
         """(N, nj) joint positions of the reference."""
-        return self.motion.joint_pos[self.frame_indexes]
+        return self.motion.joint_pos.index_select(0, self.frame_indexes)
 
     @property
     def joint_vel(self) -> torch.Tensor:
         """(N, nj) joint velocities of the reference."""
-        return self.motion.joint_vel[self.frame_indexes]
+        return self.motion.joint_vel.index_select(0, self.frame_indexes)
 
     @property
     def body_pos_w(self) -> torch.Tensor:
         """(N, K, 3) positions of the tracked bodies in the reference."""
-        return self.motion.body_pos_w[self.frame_indexes].add_(self.scene.env_origins[:, None])
+        pos = self.motion.body_pos_w.index_select(0, self.frame_indexes)
+        return pos.add_(self.scene.env_origins[:, None])
 
     @property
     def body_quat_w(self) -> torch.Tensor:
         """(N, K, 4) orientations of the tracked bodies in the reference."""
-        return self.motion.body_quat_w[self.frame_indexes]
+        return self.motion.body_quat_w.index_select(0, self.frame_indexes)
 
     @property
     def body_lin_vel_w(self) -> torch.Tensor:
         """(N, K, 3) velocities of the tracked bodies' origins in the reference."""
-        return self.motion.body_lin_vel_w[self.frame_indexes]
+        return self.motion.body_lin_vel_w.index_select(0, self.frame_indexes)
 
     @property
     def body_ang_vel_w(self) -> torch.Tensor:
         """(N, K, 3) angular velocities of the tracked bodies in the reference."""
-        return self.motion.body_ang_vel_w[self.frame_indexes]
+        return self.motion.body_ang_vel_w.index_select(0, self.frame_indexes)
 
     @property
     def anchor_pos_w(self) -> torch.Tensor:
@@ -119,12 +120,12 @@ class MotionReader:
     @property
     def robot_body_lin_vel_w(self) -> torch.Tensor:
         """(N, K, 3) velocities of the tracked bodies' origins."""
-        return self.robot.data.body_link_lin_vel_w.index_select(1, self.body_indexes)
+        return self.robot.data.link_lin_vel_of(self.body_indexes)
 
     @property
     def robot_body_ang_vel_w(self) -> torch.Tensor:
         """(N, K, 3) angular velocities of the tracked bodies."""
-        return self.robot.data.body_link_ang_vel_w.index_select(1, self.body_indexes)
+        return self.robot.data.link_ang_vel_of(self.body_indexes)
 
     @property
     def robot_anchor_pos_w(self) -> torch.Tensor:
@@ -162,23 +163,27 @@ class MotionReader:
         Returns:
             Positions (n, K, 3) and orientations (n, K, 4).
         """
-        rows: Any = slice(None) if env_ids is None else env_ids
-        frames = self.frame_indexes[rows]
+        frames, origins = self.frame_indexes, self.scene.env_origins
+        robot_pos, robot_quat = self.robot_anchor_pos_w, self.robot_anchor_quat_w
+        if env_ids is not None:
+            frames, origins, robot_pos, robot_quat = (
+                part[env_ids] for part in (frames, origins, robot_pos, robot_quat)
+            )
         # Along x and y the origins of environments cancel out.
-        body_pos, body_quat = self.motion.body_pos_w[frames], self.motion.body_quat_w[frames]
-        origins_z = self.scene.env_origins[rows, 2]
-        robot_pos, robot_quat = self.robot_anchor_pos_w[rows], self.robot_anchor_quat_w[rows]
+        body_pos = self.motion.body_pos_w.index_select(0, frames)
+        body_quat = self.motion.body_quat_w.index_select(0, frames)
         anchor_pos, anchor_quat = body_pos[:, self.anchor_index], body_quat[:, self.anchor_index]
         turn = yaw_quat(quat_mul(robot_quat, quat_inv(anchor_quat)))
         w, z = turn[:, :1], turn[:, 3:]
         # Written out, because a turn about z takes half of what any other takes.
         cos, sin = w * w - z * z, 2.0 * w * z
-        x, y = (body_pos - anchor_pos[:, None]).unbind(-1)[:2]
+        x = body_pos[..., 0] - anchor_pos[:, :1]
+        y = body_pos[..., 1] - anchor_pos[:, 1:2]
         pos = torch.stack(
             (
                 cos * x - sin * y + robot_pos[:, :1],
                 sin * x + cos * y + robot_pos[:, 1:2],
-                body_pos[..., 2] + origins_z[:, None],
+                body_pos[..., 2] + origins[:, 2:],
             ),
             dim=-1,
         )

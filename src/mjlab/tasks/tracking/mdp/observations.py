@@ -9,7 +9,7 @@ import torch
 from mjlab.compat import older_names
 from mjlab.managers.build_checks import checked_when_built
 from mjlab.tasks.tracking.mdp._shared import check_motion_term, motion_command
-from mjlab.utils.lab_api.math import quat_apply_inverse, quat_inv, quat_mul
+from mjlab.utils.lab_api.math import quat_apply_inverse, quat_conjugate, quat_mul
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -30,7 +30,7 @@ def motion_anchor_ori_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tens
     The first two columns of the rotation matrix, row by row.
     """
     command = motion_command(env, command_name)
-    relative = quat_mul(quat_inv(command.robot_anchor_quat_w), command.anchor_quat_w)
+    relative = quat_mul(quat_conjugate(command.robot_anchor_quat_w), command.anchor_quat_w)
     return _two_columns(relative)
 
 
@@ -39,8 +39,8 @@ def robot_body_pos_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     """Positions of the robot's tracked bodies in the frame of its anchor, (N, 3 K), in m."""
     command = motion_command(env, command_name)
     pos = command.robot_body_pos_w
-    quat = command.robot_anchor_quat_w[:, None].expand(-1, pos.shape[1], -1)
-    return quat_apply_inverse(quat, pos - command.robot_anchor_pos_w[:, None]).flatten(1)
+    away = pos - command.robot_anchor_pos_w[:, None]
+    return quat_apply_inverse(command.robot_anchor_quat_w[:, None], away).flatten(1)
 
 
 @checked_when_built(check_motion_term)
@@ -52,7 +52,7 @@ def robot_body_ori_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     command = motion_command(env, command_name)
     quat = command.robot_body_quat_w
     anchor = command.robot_anchor_quat_w[:, None]
-    relative = quat_mul(quat_inv(anchor).expand_as(quat), quat)
+    relative = quat_mul(quat_conjugate(anchor).expand_as(quat), quat)
     return _two_columns(relative).flatten(1)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.utils.lab_api.math import quat_from_euler_xyz, quat_mul, sample_uniform
+from mjlab.utils.torch import constant_tensor
 
 if TYPE_CHECKING:
     from mjlab.tasks.tracking.mdp.motion_loader import MotionLibrary
@@ -55,7 +56,6 @@ def perturbed_start(
 
 
 def _drawn(ranges: Mapping[str, tuple[float, float]], count: int, device: str) -> torch.Tensor:
-    bounds = torch.tensor(
-        [ranges.get(axis, (0.0, 0.0)) for axis in AXES], dtype=torch.float32, device=device
-    )
-    return sample_uniform(bounds[:, 0], bounds[:, 1], (count, len(AXES)), device)
+    bounds = zip(*(ranges.get(axis, (0.0, 0.0)) for axis in AXES), strict=True)
+    low, high = (constant_tensor(side, device) for side in bounds)
+    return sample_uniform(low, high, (count, len(AXES)), device)

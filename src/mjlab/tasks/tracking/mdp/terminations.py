@@ -9,10 +9,9 @@ import torch
 from mjlab.compat import older_names
 from mjlab.managers.build_checks import checked_when_built
 from mjlab.tasks.tracking.mdp._shared import body_columns, check_motion_term, motion_command
-from mjlab.utils.lab_api.math import quat_apply_inverse
+from mjlab.utils.lab_api.math import quat_apply_inverse as quat_apply_inverse
 
 if TYPE_CHECKING:
-    from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.managers.scene_entity_config import SceneEntityCfg
 
@@ -44,12 +43,14 @@ def bad_anchor_ori(
 
     g and g' are the unit vectors down in the frames of the two anchors.
     """
-    asset: Entity = env.scene[asset_cfg.name]
     command = motion_command(env, command_name)
-    down = asset.data.gravity_vec_w
-    reference = quat_apply_inverse(command.anchor_quat_w, down)[:, 2]
-    robot = quat_apply_inverse(command.robot_anchor_quat_w, down)[:, 2]
-    return (reference - robot).abs() > threshold
+    return (_down(command.anchor_quat_w) - _down(command.robot_anchor_quat_w)).abs() > threshold
+
+
+def _down(quat: torch.Tensor) -> torch.Tensor:
+    """Return z of the unit vector down in frames of orientation (N, 4): 2 (x^2 + y^2) - 1."""
+    x, y = quat[:, 1], quat[:, 2]
+    return 2.0 * (x * x + y * y) - 1.0
 
 
 @checked_when_built(check_motion_term)

@@ -39,5 +39,10 @@ def tracking_metrics(motion: MotionReader) -> dict[str, torch.Tensor]:
     }
 
 
-def _norm(difference: torch.Tensor) -> torch.Tensor:
-    return torch.linalg.vector_norm(difference, dim=-1)
+def _norm(vectors: torch.Tensor) -> torch.Tensor:
+    """Return Euclidean norms over the last axis."""
+    if vectors.shape[-1] > 3:
+        return torch.linalg.vector_norm(vectors, dim=-1)
+    # By components: a reduction over three numbers takes a CPU twice as long.
+    x, y, z = vectors.unbind(-1)
+    return (x * x).addcmul_(y, y).addcmul_(z, z).sqrt_()

@@ -44,7 +44,8 @@ def log_metric(env: ManagerBasedRlEnv, name: str, value: torch.Tensor) -> None:
 
 def masked_mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     """Return the mean of the finite values where `mask` is true, as one number; 0 if there are none."""
-    mask = mask & torch.isfinite(values)
+    # `isfinite` takes twice the operations.
+    mask = mask & (values.abs() < torch.inf)
     return torch.where(mask, values, 0.0).sum() / mask.sum().clamp(min=1)
 
 
@@ -54,7 +55,8 @@ def tilt_of(quat: torch.Tensor) -> torch.Tensor:
     With x and y of a unit quaternion, that of the third row of its rotation matrix is
     `4 s (1 - s)`, where s = x^2 + y^2.
     """
-    share = quat[:, 1:3].square().sum(dim=1)
+    x, y = quat[:, 1], quat[:, 2]
+    share = x * x + y * y
     return 4.0 * share * (1.0 - share)
 
 

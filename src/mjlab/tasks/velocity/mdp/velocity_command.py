@@ -189,9 +189,6 @@ class UniformVelocityCommand(CommandTerm):
             return {}
         if self._joystick is not None:
             self._joystick.let_go(self.vel_command_b)
-        never_stepped = self._samples[ids] == 0.0
-        for values in self.metrics.values():
-            values[ids] = values[ids].masked_fill_(never_stepped, torch.nan)
         log = super().reset(ids)
         self._samples[ids] = 0.0
         if self.cfg.init_velocity_prob > 0.0:
@@ -282,6 +279,9 @@ class UniformVelocityCommand(CommandTerm):
         self.robot.write_root_link_velocity_to_sim(velocity, env_ids=env_ids)
 
     # Metrics and drawing.
+
+    def _is_measured(self, env_ids: torch.Tensor) -> torch.Tensor:
+        return self._samples[env_ids] > 0.0
 
     def _add_sample(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None) -> None:
         """Take up the error of the command that the last step followed into the running means."""
