@@ -54,6 +54,17 @@ for task in (
         "rl.evaluation is default in the table, and "
         f"{ {'_': 'EvaluationCfg', **_PLACEMENT}!r} here",
     }
+# Configs pickle, which those with a lambda do not.
+DEVIATIONS["Mjlab-Multi-Cube-Seg-Yam"] |= {
+    f"env.scene.entities.{name}.spec_fn is 'tasks.manipulation.config.yam.env_cfgs:"
+    "yam_multi_cube_seg_env_cfg.<locals>.<lambda>' in the table, "
+    f"{ {'_': '_ColoredCube', 'rgba': rgba}!r} here"
+    for name, rgba in (
+        ("cube_0", [0.9, 0.17999999999999997, 0.17999999999999997, 1.0]),
+        ("cube_1", [0.17999999999999997, 0.9, 0.17999999999999997, 1.0]),
+        ("cube_2", [0.17999999999999997, 0.17999999999999997, 0.9, 1.0]),
+    )
+}
 # Motion tracking works without naming a motion, ends episodes where the motion does, and plays without
 # noise in the joints. What evaluations measure, and how, is ours.
 _MOTION_ERRORS = {

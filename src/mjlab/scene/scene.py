@@ -33,7 +33,7 @@ from mjlab.sensor import (
 )
 from mjlab.sim.engine import Stage
 from mjlab.terrains.terrain_entity import TerrainEntity, TerrainEntityCfg
-from mjlab.utils.spec import compile_composed, export_spec, make_asset_paths_absolute
+from mjlab.utils.spec import attach, compile_composed, export_spec, make_asset_paths_absolute
 from mjlab.utils.state import stateful
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ class Scene:
         for key in list(entity.spec.keys):
             entity.spec.delete(key)
         make_asset_paths_absolute(entity.spec)
-        self._spec.attach(entity.spec, prefix=prefix, frame=self._spec.worldbody.add_frame())
+        attach(self._spec, entity.spec, prefix, self._spec.worldbody.add_frame())
 
     def _apply_entity_options(self) -> dict[str, OptionRequest]:
         requests = merge_entity_options(

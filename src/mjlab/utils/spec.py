@@ -30,12 +30,25 @@ MOCAP_BASE_NAME = "mocap_base"
 _NOT_DATA = {"name", "id", "signature", "classname", "compiler"}
 
 
-def compile_composed(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a spec that others were attached to without a prefix.
+def attach(
+    parent: mujoco.MjSpec, child: mujoco.MjSpec, prefix: str, frame: mujoco.MjsFrame
+) -> None:
+    """Attach `child` to a frame of `parent`; its elements move there.
 
-    MuJoCo warns at each compilation that such a spec may not be saved correctly; what this package
-    saves, it repairs (`fix_spec_xml`).
+    Without a prefix MuJoCo prints, and logs to a file, that such a spec may not be saved correctly:
+    default classes lose their names. What this package saves, it repairs (`fix_spec_xml`).
     """
+    handler = mujoco.get_mju_user_warning()
+    if not prefix:
+        mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        parent.attach(child, prefix=prefix, frame=frame)
+    finally:
+        mujoco.set_mju_user_warning(handler)
+
+
+def compile_composed(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile a spec that others may be attached to without a prefix, of which MuJoCo warns again."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Attaching a spec with an empty prefix")
         return spec.compile()
@@ -152,7 +165,7 @@ def _under_mocap_base(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     base = parent.worldbody.add_body(name=MOCAP_BASE_NAME, mocap=True)
     for key in list(child.keys):
         child.delete(key)
-    parent.attach(child, prefix="", frame=base.add_frame())
+    attach(parent, child, "", base.add_frame())
     for key in spec.keys:
         fields = ("name", "time", "qpos", "qvel", "act", "ctrl")
         parent.add_key(**{field: getattr(key, field) for field in fields})
