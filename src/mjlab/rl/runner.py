@@ -123,6 +123,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             env, self.alg, self.cfg.get("evaluation") or {}, int(self.cfg.get("seed", 0))
         )
         self._num_threads = self._resolve_threads()
+        # Beside the threads of the physics, waiting ones of OpenMP cost more than they bring.
+        on_cpu = torch.device(self.device).type == "cpu"
+        self._num_collecting_threads = 1 if on_cpu else self._num_threads
         self._speeds = SpeedWatch(self.env.unwrapped)
 
     # The training loop.
@@ -188,7 +191,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             begin = time.perf_counter()
             with self._speeds.explaining(self.alg.get_policy()):
                 with torch.inference_mode():
-                    observations = self._collect(observations)
+                    with using_torch_threads(self._num_collecting_threads):
+                        observations = self._collect(observations)
                     collected = time.perf_counter()
                     self.alg.compute_returns(observations)
                 losses = self.alg.update()
