@@ -207,7 +207,7 @@ def build_indexing(
 
 
 def _moved_bodies(model: mujoco.MjModel, dofs: list[int], bodies: list[int]) -> torch.Tensor:
-    moves = torch.zeros(len(dofs), len(bodies))
+    moves = torch.zeros(len(dofs), len(bodies), dtype=torch.float32)
     for column, body in enumerate(bodies):
         ancestors = set()
         while body:

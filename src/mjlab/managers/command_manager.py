@@ -98,7 +98,7 @@ class CommandTerm(ManagerTermBase):
             self._resample(due)
         self._update_command(env_ids)
 
-    def reset(self, env_ids: torch.Tensor | slice | None) -> dict[str, Any]:
+    def reset(self, env_ids: torch.Tensor | slice | None) -> dict[str, float]:
         """Draw new commands in these environments, and return and zero the mean of each metric.
 
         Environments that `_is_measured` excludes are left out of the means, and those where a
@@ -107,13 +107,13 @@ class CommandTerm(ManagerTermBase):
         ids = as_ids(env_ids, self.num_envs, self.device)
         if is_empty(ids):
             return {}
-        log: dict[str, Any] = {}
+        log: dict[str, float] = {}
         if self.metrics:
             values = torch.stack([metric[ids].float() for metric in self.metrics.values()])
             is_measured = self._is_measured(ids)
             if is_measured is not None:
                 values.masked_fill_(~is_measured, torch.nan)
-            log = dict(zip(self.metrics, finite_mean(values).unbind(), strict=True))
+            log = dict(zip(self.metrics, finite_mean(values).tolist(), strict=True))
             for metric in self.metrics.values():
                 metric[ids] = 0.0
         self.command_counter[ids] = 0

@@ -87,8 +87,7 @@ class TerminationManager(TermListManager):
         self._reset_class_terms(env_ids)
         if is_empty(env_ids) or not self._term_names:
             return {}
-        # Left on the device: whoever logs them fetches them.
-        counts = self._values[:, as_index(env_ids)].sum(dim=1).unbind()
+        counts = self._values[:, as_index(env_ids)].sum(dim=1).tolist()
         return {
             f"Episode_Termination/{name}": count
             for name, count in zip(self._term_names, counts, strict=True)

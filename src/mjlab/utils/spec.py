@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import warnings
 from collections.abc import Callable, Collection
 from typing import Any
@@ -24,7 +25,10 @@ from mjlab.utils.spec_export import (  # noqa: F401
     put_files_in_memory,
 )
 
+logger = logging.getLogger(__name__)
+
 MOCAP_BASE_NAME = "mocap_base"
+_EMPTY_PREFIX = "Attaching a spec with an empty prefix"
 
 # What belongs to an element's place in its spec rather than to what it is.
 _NOT_DATA = {"name", "id", "signature", "classname", "compiler"}
@@ -39,18 +43,21 @@ def attach(
     default classes lose their names. What this package saves, it repairs (`fix_spec_xml`).
     """
     handler = mujoco.get_mju_user_warning()
-    if not prefix:
-        mujoco.set_mju_user_warning(lambda message: None)
+    messages: list[str] = []
+    mujoco.set_mju_user_warning(messages.append)
     try:
         parent.attach(child, prefix=prefix, frame=frame)
     finally:
         mujoco.set_mju_user_warning(handler)
+    for message in messages:
+        if not message.startswith(_EMPTY_PREFIX):
+            logger.warning(message)
 
 
 def compile_composed(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a spec that others may be attached to without a prefix, of which MuJoCo warns again."""
+    """Compile a spec without MuJoCo's warning about empty prefixes; see `attach`."""
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Attaching a spec with an empty prefix")
+        warnings.filterwarnings("ignore", message=_EMPTY_PREFIX)
         return spec.compile()
 
 
