@@ -130,8 +130,10 @@ def _other_envs_kept(term: Any, env_ids: Any) -> Generator[None]:
         moved |= not torch.equal(kept, field)
         field.copy_(kept)
     if moved:
-        # The body may have computed derived quantities from the state that was put back.
-        term._env.sim.forward()
+        # The body may have computed derived quantities from the state that was put back; forces of
+        # the environments that it was not asked for stay those of the last substep.
+        term._env.sim.forward(stage="vel")
+        term._env.sim.forward(env_ids)
 
 
 def _hides_class_state(term: Any, name: str) -> bool:

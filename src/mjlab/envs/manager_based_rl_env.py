@@ -280,8 +280,8 @@ class ManagerBasedRlEnv:
           positions or mocap pose, by a writer of `Entity`). Contact histories and air times begin
           with the first substep after a reset.
 
-        A command that writes positions runs `sim.forward(env_ids)` itself, on the environments
-        concerned.
+        A command that writes positions, and a term that writes `sim.data` itself, runs
+        `sim.forward(env_ids)`, on the environments concerned.
 
         Args:
             action: (N, A) float tensor; an array or a list is converted.
