@@ -399,10 +399,10 @@ class ManagerBasedRlEnv:
         # Before the first substep there is nothing to keep.
         if len(full) == self.num_envs or self._sim_step_counter == 0:
             self.sim.forward()
-            return
-        self.sim.forward(stage="vel")
-        if len(full) > 0:
-            self.sim.forward(full)
+        elif len(full) > 0:
+            self.sim.forward_after_reset(full)
+        else:
+            self.sim.forward(stage="vel")
 
     def _compute_commands(
         self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None

@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from mjlab.envs.manager_based_rl_env import ManagerBasedRlEnv
 
 # Methods of the simulation and the scene that a step calls, and the phase that each belongs to.
-_SIMULATION = {"step": "physics", "forward": "forward", "sense": "sense", "reset": "reset"}
+_SIMULATION = {
+    **{"step": "physics", "forward": "forward", "forward_after_reset": "forward"},
+    **{"sense": "sense", "reset": "reset"},
+}
 _SCENE = {"write_data_to_sim": "actuators", "update": "sensors", "reset": "reset"}
 # Methods of each manager that a step calls; the phase is named after the manager.
 _MANAGERS = {

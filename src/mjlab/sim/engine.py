@@ -276,6 +276,11 @@ class Engine(ABC):
         sensors of later stages keep their values.
         """
 
+    def forward_after_reset(self, reset_ids: torch.Tensor) -> None:
+        """Make everything current in some environments, positions and velocities in the others."""
+        self.forward(None, "vel")
+        self.forward(reset_ids)
+
     @abstractmethod
     def reset(self, env_ids: torch.Tensor | None) -> None:
         """Put environments into the model's initial state: time 0, qpos0, everything else zero.

@@ -422,6 +422,17 @@ class Simulation:
         for callback in self._forward_callbacks:
             callback(stage)
 
+    def forward_after_reset(self, env_ids: torch.Tensor) -> None:
+        """Run `forward(env_ids)`, and `forward(stage="vel")` for the other environments.
+
+        On Warp this costs one forward pass instead of two.
+        """
+        resolved = self.resolve_ids(env_ids)
+        assert resolved is not None
+        self._engine.forward_after_reset(resolved)
+        for callback in self._forward_callbacks:
+            callback("acc")
+
     def reset(self, env_ids: EnvIds = None) -> None:
         """Put environments into the model's initial state: time 0, `qpos0`, the rest zero.
 

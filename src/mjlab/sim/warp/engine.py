@@ -14,7 +14,7 @@ import difflib
 import gc
 import logging
 import os
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Sequence, Set
 from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -444,17 +444,42 @@ class WarpEngine(Engine):
             mjwarp.com_vel(self.wp_model, self.wp_data)
 
     def forward(self, env_ids: torch.Tensor | None, stage: Stage = "acc") -> None:
-        # Warp computes all environments and uses fields of later stages as scratch; what was not
-        # asked for gets its values back. Fields that are one substep old stay so, as on native.
-        others = self._rows_except(env_ids)
+        results = self._data_tensors.keys() - set(_STATE_FIELDS)
+        self._forward_except(self._rows_except(env_ids), stage, results)
+
+    def forward_after_reset(self, reset_ids: torch.Tensor) -> None:
+        # One full pass, because a partial one costs as much as one of all.
+        self._forward_except(self._rows_except(reset_ids), "acc", ACCELERATION_FIELDS, "vel")
+
+    def _forward_except(
+        self,
+        others: torch.Tensor | None,
+        stage: Stage,
+        results: Set[str],
+        done: Stage | None = None,
+    ) -> None:
+        """Compute stages up to `stage`; environments `others` keep `results` and their sensors.
+
+        Warp computes all environments and uses fields of later stages as scratch. Those get their
+        values back: fields that are one substep old stay so, as on native.
+
+        Args:
+            others: (N,) bool, or None for no environment.
+            stage: Last stage.
+            results: Fields that `others` keep.
+            done: Stage up to which `others` do not keep sensors either; None keeps all of them.
+        """
         kept: list[tuple[torch.Tensor, torch.Tensor | None]] = []
         for name, tensor in self._data_tensors.items():
             if name == "sensordata":
-                late = (self._sensor_stages > int(_STAGES[stage]))[None]
-                kept.append((tensor, late if others is None else late | others[:, None]))
+                mask = (self._sensor_stages > int(_STAGES[stage]))[None]
+                if others is not None:
+                    late = self._sensor_stages > (int(_STAGES[done]) if done else -1)
+                    mask = mask | (others[:, None] & late)
+                kept.append((tensor, mask))
             elif name in _OVERWRITTEN[stage]:
                 kept.append((tensor, None))
-            elif others is not None and name not in _STATE_FIELDS:
+            elif others is not None and name in results:
                 kept.append((tensor, others))
         with _keeping(kept):
             if len(self._static_geoms) and not _STATIC_POSE.isdisjoint(self._model_tensors):
@@ -598,15 +623,15 @@ class WarpEngine(Engine):
                 getattr(mj_data, name)[:] = value
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "data": {name: self.data_field(name).cpu().clone() for name in _STATE_FIELDS},
+        tensors = {
+            "data": {name: self.data_field(name) for name in _STATE_FIELDS},
             # No forward pass gives these as the last substep did.
-            "results": {
-                name: tensor.cpu().clone()
-                for name, tensor in self._data_tensors.items()
-                if name in ACCELERATION_FIELDS or name == "sensordata"
-            },
-            "model": {name: tensor.cpu().clone() for name, tensor in self._model_tensors.items()},
+            "results": self._last_results(),
+            "model": self._model_tensors,
+        }
+        return {
+            kind: {name: tensor.cpu().clone() for name, tensor in fields.items()}
+            for kind, fields in tensors.items()
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -621,11 +646,17 @@ class WarpEngine(Engine):
             self._model_tensors[name].copy_(value)
         for name, value in state["data"].items():
             self.data_field(name).copy_(value)
-        # Earlier releases saved no results.
+        # Earlier releases saved no results, or those that were read.
         results = state.get("results", {})
         self.forward(None, "vel" if results else "acc")
-        for name, value in results.items():
-            self.data_field(name).copy_(value)
+        for name, tensor in self._last_results().items():
+            if name in results:
+                tensor.copy_(results[name])
+
+    def _last_results(self) -> dict[str, torch.Tensor]:
+        """Return the results of the acceleration stage, read by someone or not, and all sensors."""
+        names = sorted(offered_data_fields(self.wp_data) & (ACCELERATION_FIELDS | {"sensordata"}))
+        return {name: as_torch(getattr(self.wp_data, name)) for name in names}
 
 
 def refuse_unsupported(model: mujoco.MjModel) -> None:
@@ -701,17 +732,19 @@ def _as_tensors(struct: Any) -> SimpleNamespace:
     )
 
 
+def offered_data_fields(data: Any) -> set[str]:
+    """Return the names of the `MjData` fields that every environment has."""
+    fields = _fields_over(type(data), "nworld") - _UNLIKE_MUJOCO
+    return {name for name in fields if hasattr(mujoco.MjData, name)}
+
+
 def find_data_field(data: Any, name: str) -> Any:
     """Return the Warp array of an `MjData` field that every environment has.
 
     Raises:
         AttributeError: there is no such field; the message says what to use, or close names.
     """
-    known = {
-        field
-        for field in _fields_over(type(data), "nworld") - _UNLIKE_MUJOCO
-        if hasattr(mujoco.MjData, field)
-    }
+    known = offered_data_fields(data)
     if name in known:
         return getattr(data, name)
     if name == "ncon" or name.startswith("efc"):
