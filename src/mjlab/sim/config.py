@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
 from mjlab.compat import ALWAYS_ENABLED_FLAGS, accepts_older_fields
@@ -11,26 +11,15 @@ from mjlab.utils.nan_guard import NanGuardCfg
 if TYPE_CHECKING:
     import mujoco
 
-_FLAG_PREFIXES = {"disableflags": "mjDSBL_", "enableflags": "mjENBL_"}
-
-# Options that differ from their config value only in being an enum of MuJoCo, by prefix.
-_ENUM_OPTIONS = {
+# Options whose values are names of members of a MuJoCo enum, with the prefix of the members.
+_ENUMS = {
     "jacobian": ("mjtJacobian", "mjJAC_"),
     "cone": ("mjtCone", "mjCONE_"),
     "integrator": ("mjtIntegrator", "mjINT_"),
     "solver": ("mjtSolver", "mjSOL_"),
+    "disableflags": ("mjtDisableBit", "mjDSBL_"),
+    "enableflags": ("mjtEnableBit", "mjENBL_"),
 }
-
-_PLAIN_OPTIONS = (
-    "timestep",
-    "impratio",
-    "gravity",
-    "iterations",
-    "tolerance",
-    "ls_iterations",
-    "ls_tolerance",
-    "ccd_iterations",
-)
 
 
 @accepts_older_fields
@@ -73,32 +62,22 @@ class MujocoCfg:
         Raises:
             ValueError: an option or flag that MuJoCo does not know, with those it does.
         """
-        import mujoco
-
-        for name, (enum_name, prefix) in _ENUM_OPTIONS.items():
-            value = _enum_value(mujoco, name, enum_name, prefix, getattr(self, name))
-            setattr(model.opt, name, value)
-        for name in _PLAIN_OPTIONS:
-            value = getattr(self, name)
-            if name == "gravity":
-                model.opt.gravity[:] = value
+        for option in fields(MujocoCfg):
+            name, value = option.name, getattr(self, option.name)
+            if name.endswith("flags"):
+                for flag in value:
+                    if flag not in ALWAYS_ENABLED_FLAGS or name == "disableflags":
+                        bits = getattr(model.opt, name) | _enum_value(name, flag)
+                        setattr(model.opt, name, bits)
             else:
-                setattr(model.opt, name, value)
-        model.opt.disableflags |= self._flags(mujoco, "disableflags")
-        model.opt.enableflags |= self._flags(mujoco, "enableflags")
-
-    def _flags(self, mujoco: Any, kind: str) -> int:
-        enum_name = "mjtDisableBit" if kind == "disableflags" else "mjtEnableBit"
-        bits = 0
-        for flag in getattr(self, kind):
-            if kind == "enableflags" and flag in ALWAYS_ENABLED_FLAGS:
-                continue
-            bits |= int(_enum_value(mujoco, kind, enum_name, _FLAG_PREFIXES[kind], flag))
-        return bits
+                setattr(model.opt, name, _enum_value(name, value) if name in _ENUMS else value)
 
 
-def _enum_value(mujoco: Any, option: str, enum_name: str, prefix: str, name: str) -> Any:
+def _enum_value(option: str, name: str) -> Any:
     """Return MuJoCo's enum member for a lower-case name, or raise listing the valid names."""
+    import mujoco
+
+    enum_name, prefix = _ENUMS[option]
     members = {
         member[len(prefix) :].lower(): value
         for member, value in getattr(mujoco, enum_name).__members__.items()

@@ -6,30 +6,35 @@ that holds a Warp array or struct of its own, such as `sim.wp_data`. Importing t
 
 from __future__ import annotations
 
-from functools import partialmethod
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
-if TYPE_CHECKING:
-    import torch
+import torch
 
 T = TypeVar("T")
 
 
-class TorchArray:
-    """A Warp array that is indexed, written and computed with as a torch tensor, without a copy.
+class TorchArray(torch.Tensor):
+    """A torch tensor that shares the memory of a Warp array. Results of operations are plain.
 
     An array with a single row that stands for `nworld` worlds reads as `nworld` equal rows; it is
     refused when written by `[...] = ...`, because one row cannot hold different values.
     """
 
-    def __init__(self, wp_array: Any, nworld: int | None = None) -> None:
+    __torch_function__ = torch._C._disabled_torch_function_impl
+    _wp_array: Any
+    _is_shared: bool
+
+    def __new__(cls, wp_array: Any, nworld: int | None = None) -> TorchArray:
+        """View `wp_array`, of one row or of `nworld` rows."""
         from mjlab.sim.warp.engine import as_torch
 
         tensor = as_torch(wp_array)
-        self._wp_array = wp_array
-        worlds = 1 if nworld is None else nworld
-        self._shared = worlds > 1 and tensor.shape[0] == 1
-        self._tensor = tensor.expand(worlds, *tensor.shape[1:]) if self._shared else tensor
+        is_shared = nworld is not None and nworld > 1 and tensor.shape[0] == 1
+        if is_shared:
+            tensor = tensor.expand(nworld, *tensor.shape[1:])
+        array = torch.Tensor._make_subclass(cls, tensor)
+        array._wp_array, array._is_shared = wp_array, is_shared
+        return array
 
     @property
     def wp_array(self) -> Any:
@@ -38,58 +43,19 @@ class TorchArray:
 
     @property
     def tensor(self) -> torch.Tensor:
-        """The tensor that shares the array's memory."""
-        return self._tensor
+        """The same as a plain tensor."""
+        return self.as_subclass(torch.Tensor)
 
     def __getitem__(self, idx: Any) -> Any:
-        return self._tensor[idx]
+        return super().__getitem__(idx)
 
     def __setitem__(self, idx: Any, value: Any) -> None:
-        if self._shared:
+        if self._is_shared:
             raise RuntimeError(
                 "This model field is one row that all environments share. Give each its own with "
                 "sim.expand_model_fields((name,)) before writing it."
             )
-        self._tensor[idx] = value
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or "_tensor" not in self.__dict__:
-            raise AttributeError(name)
-        return getattr(self._tensor, name)
-
-    def __len__(self) -> int:
-        return len(self._tensor)
-
-    def __repr__(self) -> str:
-        return f"TorchArray({self._tensor!r})"
-
-    @classmethod
-    def __torch_function__(
-        cls, func: Any, types: Any, args: Any = (), kwargs: Any | None = None
-    ) -> Any:
-        plain = [_unwrap(argument) for argument in args]
-        named = {name: _unwrap(value) for name, value in (kwargs or {}).items()}
-        return func(*plain, **named)
-
-    def _operate(self, operator: str, *others: Any) -> Any:
-        return getattr(self._tensor, operator)(*[_unwrap(other) for other in others])
-
-
-# Python looks operators up on the class and never asks `__getattr__`.
-for _name in ("add", "sub", "mul", "truediv", "floordiv", "mod", "pow", "matmul", "and", "or"):
-    setattr(TorchArray, f"__{_name}__", partialmethod(TorchArray._operate, f"__{_name}__"))
-    setattr(TorchArray, f"__r{_name}__", partialmethod(TorchArray._operate, f"__r{_name}__"))
-for _name in ("neg", "abs", "invert", "lt", "le", "gt", "ge", "eq", "ne", "float", "int", "bool"):
-    setattr(TorchArray, f"__{_name}__", partialmethod(TorchArray._operate, f"__{_name}__"))
-TorchArray.__hash__ = object.__hash__
-
-
-def _unwrap(value: Any) -> Any:
-    if isinstance(value, TorchArray):
-        return value.tensor
-    if isinstance(value, (list, tuple)):
-        return type(value)(_unwrap(item) for item in value)
-    return value
+        super().__setitem__(idx, value)
 
 
 class WarpBridge(Generic[T]):
@@ -117,20 +83,21 @@ class WarpBridge(Generic[T]):
         self.__dict__["_cache"].clear()
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or "_struct" not in self.__dict__:
+        if name.startswith("__"):
             raise AttributeError(name)
         cache = self.__dict__["_cache"]
         if name not in cache:
             value = getattr(self.struct, name)
             if not (hasattr(value, "ptr") and hasattr(value, "dtype")):
                 return value
-            cache[name] = TorchArray(value, self.nworld if _is_batched(value) else None)
+            # MuJoCo Warp marks arrays whose first dimension is the worlds.
+            is_batched = getattr(value, "_is_batched", False)
+            cache[name] = TorchArray(value, self.nworld if is_batched else None)
         return cache[name]
 
     def __setattr__(self, name: str, value: Any) -> None:
-        raise AttributeError(f"{name} cannot be replaced; write into it in place: {name}[:] = ...")
-
-
-def _is_batched(array: Any) -> bool:
-    """Return whether the array's first dimension is the worlds; MuJoCo Warp marks those."""
-    return bool(getattr(array, "_is_batched", False))
+        # `data.qpos += 1` writes in place and then assigns the array to itself.
+        if value is not self.__dict__["_cache"].get(name):
+            raise AttributeError(
+                f"{name} cannot be replaced; write into it in place: {name}[:] = ..."
+            )

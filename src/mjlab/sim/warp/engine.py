@@ -38,7 +38,7 @@ from mjlab.sim.engine import (
     check_sensor_fed,
 )
 from mjlab.sim.randomization import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
-from mjlab.sim.warp.overflow import OverflowWatch, contacts_per_environment
+from mjlab.sim.warp.overflow import OverflowWatch
 from mjlab.sim.warp.rays import WarpRays
 from mjlab.sim.warp.render import WarpRenderer
 from mjlab.utils.lab_api.math import matrix_from_quat, matrix_product
@@ -166,16 +166,13 @@ class WarpEngine(Engine):
         if self.wp_model.sensor_rne_postconstraint:
             self.data_field("cacc")
             self.data_field("cfrc_int")
-        self._overflow = OverflowWatch(
-            as_torch(self.wp_data.overflow),
-            {kind.name: int(kind) for kind in mjwarp.OverflowType},
-            {
-                "njmax": self.wp_data.njmax,
-                "nconmax": self.wp_data.naconmax // self.num_envs,
-                "contact_sensor_maxmatch": cfg.contact_sensor_maxmatch,
-            },
-            self._sizes_needed,
-        )
+        self.capacities = {
+            "njmax": self.wp_data.njmax,
+            "nconmax": self.wp_data.naconmax // self.num_envs,
+            "contact_sensor_maxmatch": cfg.contact_sensor_maxmatch,
+        }
+        """Room for constraint rows and contacts per environment, and for matches of a sensor."""
+        self._overflow = OverflowWatch(self, as_torch(self.wp_data.overflow))
         self.capabilities = Capabilities(
             name="warp",
             device=str(device),
@@ -540,17 +537,20 @@ class WarpEngine(Engine):
         """Log now, once a kind, what exceeded its capacity so far. Waits for the GPU."""
         self._overflow.check(wait=True)
 
-    def _sizes_needed(self) -> torch.Tensor:
-        """Return (3,): constraint rows and contacts per environment, and matches of a sensor.
+    def measure_sizes(self) -> torch.Tensor:
+        """Return what is needed now of each of `capacities`, (3,).
 
         No sensor can match more contacts than its environment has.
         """
         data = self.wp_data
         rows, contacts = as_torch(data.nefc).amax(), as_torch(data.nacon)
         pooled = torch.maximum(contacts, as_torch(data.ncollision))[0]
-        matches = contacts_per_environment(as_torch(data.contact.worldid), contacts, self.num_envs)
+        environments = as_torch(data.contact.worldid)
+        exists = torch.arange(len(environments), device=self.device) < contacts
+        totals = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
+        totals.scatter_add_(0, environments.clamp(0, self.num_envs - 1).long(), exists.long())
         # Contacts are pooled, so only their mean has to fit. It is rounded up.
-        return torch.stack([rows, -(-pooled // self.num_envs), matches])
+        return torch.stack([rows, -(-pooled // self.num_envs), totals.amax()])
 
     def close(self) -> None:
         """Log what exceeded its capacity since the last look."""
