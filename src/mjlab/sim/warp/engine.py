@@ -11,11 +11,13 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import gc
 import logging
+import operator
 import os
 from collections.abc import Callable, Generator, Sequence, Set
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +31,7 @@ from mjlab.sim.engine import (
     ACCELERATION_FIELDS,
     COLLISION_MASKS,
     INPUTS,
+    RESULTS_ZERO_ON_RESET,
     ROTATION_MATRICES,
     ZERO_INPUTS,
     Capabilities,
@@ -71,16 +74,7 @@ _STAGES = {
     "acc": mujoco.mjtStage.mjSTAGE_ACC,
 }
 # Results that MuJoCo's reset clears too. Poses and velocities keep their values until `forward`.
-_RESULTS_ZERO_ON_RESET = (
-    "qacc",
-    "act_dot",
-    "sensordata",
-    "energy",
-    "ne",
-    "nf",
-    "nl",
-    "nefc",
-)
+_RESULTS_ZERO_ON_RESET = (*RESULTS_ZERO_ON_RESET, "energy", "ne", "nf", "nl", "nefc")
 # Metres from everything else.
 _NOWHERE = 1e6
 # What follows from `geom_size`, and is per environment only where sizes are.
@@ -143,7 +137,7 @@ class WarpEngine(Engine):
         self._data_tensors: dict[str, torch.Tensor] = {}
         self._model_tensors: dict[str, torch.Tensor] = {}
         self._graphs: dict[str, Any] = {}
-        self._loaded: set[str] = set()
+        self._warned_of_capture = False
         self._absent: torch.Tensor | None = None
         self._rays: WarpRays | None = None
         self._renderer: WarpRenderer | None = None
@@ -186,9 +180,21 @@ class WarpEngine(Engine):
 
     def _allocate(self, model: mujoco.MjModel, cfg: SimulationCfg) -> None:
         limits = {"nconmax": cfg.nconmax, "njmax": cfg.njmax}
+        # At `qpos0` all robots are at the origin of the world, which may be deep inside a generated
+        # terrain. No episode starts there, so its contacts say nothing about the sizes needed.
+        if cfg.nconmax is not None and self._host.ncon > cfg.nconmax:
+            logger.warning(
+                "The reference pose has %d contacts, more than SimulationCfg.nconmax=%d. They are "
+                "left out until the first reset. If later poses have as many, set nconmax to that.",
+                self._host.ncon, cfg.nconmax,
+            )  # fmt: skip
+            flags = model.opt.disableflags
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+            mujoco.mj_forward(model, self._host)
+            model.opt.disableflags = flags
         try:
             self.wp_model = mjwarp.put_model(model)
-            self.wp_data = mjwarp.put_data(model, self._placed(model, cfg), self.num_envs, **limits)
+            self.wp_data = mjwarp.put_data(model, self._host, self.num_envs, **limits)
         except NotImplementedError as error:
             raise UnsupportedByWarpError(
                 f"The warp engine cannot simulate this model: {error} "
@@ -204,27 +210,6 @@ class WarpEngine(Engine):
         self.wp_model.opt.warn_overflow = 0
         if self._on_cuda:
             self.wp_model.opt.graph_conditional = wp.is_conditional_graph_supported()
-
-    def _placed(self, model: mujoco.MjModel, cfg: SimulationCfg) -> mujoco.MjData:
-        """Return the state to start from: that of `qpos0`, without contacts where they do not fit.
-
-        In the reference pose all robots are at the origin of the world, which may be deep inside a
-        generated terrain. Nobody starts an episode there, so that its contacts say nothing about
-        the sizes that are needed.
-        """
-        if cfg.nconmax is None or self._host.ncon <= cfg.nconmax:
-            return self._host
-        logger.warning(
-            "The reference pose has %d contacts, more than SimulationCfg.nconmax=%d. They are left "
-            "out until the first reset. If later poses have as many, set nconmax to that.",
-            self._host.ncon, cfg.nconmax,
-        )  # fmt: skip
-        free = mujoco.MjData(model)
-        flags = model.opt.disableflags
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-        mujoco.mj_forward(model, free)
-        model.opt.disableflags = flags
-        return free
 
     # Order of work on the GPU.
 
@@ -263,18 +248,14 @@ class WarpEngine(Engine):
         capture does not record there: filling arrays, and refitting trees.
         """
         with self.ordered():
-            if name not in self._loaded and (self._on_cuda or not on_cpu):
-                work()
-                times -= 1
+            if name not in self._graphs:
                 if self._on_cuda:
-                    self._loaded.add(name)
-            if times and name not in self._graphs:
-                self._graphs[name] = self._capture(work)
-            for _ in range(times):
-                if self._graphs[name] is None:
                     work()
-                else:
-                    wp.capture_launch(self._graphs[name])
+                    times -= 1
+                self._graphs[name] = self._capture(work) if self._on_cuda or on_cpu else None
+            graph = self._graphs[name]
+            for _ in range(times):
+                work() if graph is None else wp.capture_launch(graph)
 
     def _capture(self, work: Callable[[], None]) -> Any:
         """Return the graph of `work`, or None where capturing is refused."""
@@ -286,7 +267,8 @@ class WarpEngine(Engine):
                 work()
             return capture.graph
         except RuntimeError as error:
-            if None not in self._graphs.values():
+            if not self._warned_of_capture:
+                self._warned_of_capture = True
                 logger.warning(
                     "Warp captures no graph here, so that kernels are launched one by one, which "
                     "is slower: %s", error,
@@ -302,24 +284,16 @@ class WarpEngine(Engine):
 
         Elsewhere, and after `expand`, they are captured when next needed.
         """
-        self._forget_graphs()
+        self._graphs.clear()
         if not self._on_cuda:
             return
-        before = {name: self.data_field(name).clone() for name in _STATE_FIELDS}
-        # Once plainly, and once captured.
-        for _ in range(2):
+        with _keeping([(self.data_field(name), None) for name in _STATE_FIELDS]):
             self.launch("step", self._substep)
             for stage in _STAGES:
                 self.launch(stage, lambda stage=stage: self._forward(stage))
-        for name, value in before.items():
-            self.data_field(name).copy_(value)
         self.forward(None)
         # What overflowed then is no fault of the user's.
         as_torch(self.wp_data.overflow).zero_()
-
-    def _forget_graphs(self) -> None:
-        self._graphs.clear()
-        self._loaded.clear()
 
     # Fields.
 
@@ -328,7 +302,8 @@ class WarpEngine(Engine):
         if name == "nacon":
             return as_torch(self.wp_data.nacon)
         if name == "contact":
-            return _as_tensors(self.wp_data.contact)
+            arrays = vars(self.wp_data.contact).items()
+            return SimpleNamespace(**{key: as_torch(array) for key, array in arrays})
         if name not in self._data_tensors:
             array = find_data_field(self.wp_data, name)
             check_sensor_fed(self.mj_model, name)
@@ -353,10 +328,12 @@ class WarpEngine(Engine):
             expand_arrays(self.wp_model, self.num_envs, new)
         for name in new:
             struct, attribute = find_model_field(self.wp_model, name)
-            self._model_tensors[name] = _like_mujoco(name, getattr(struct, attribute))
+            tensor = as_torch(getattr(struct, attribute))
+            # MuJoCo stores centers and half sizes in one row.
+            self._model_tensors[name] = tensor.flatten(-2) if name == "geom_aabb" else tensor
         # A graph keeps the addresses of the arrays it was captured with.
         if new and self.num_envs > 1:
-            self._forget_graphs()
+            self._graphs.clear()
 
     @torch.inference_mode(False)
     def hide_geoms(self, absent: torch.Tensor) -> None:
@@ -389,20 +366,14 @@ class WarpEngine(Engine):
             with self.ordered():
                 _RECOMPUTE[level](self.wp_model, self.wp_data)
             if "body_invweight0" in written:
-                self._restore_zero_invweights()
+                # A body that only slides has no rotational inverse weight, and one that turns about
+                # its center of mass no translational one. Warp puts the other one in its place.
+                weights = as_torch(self.wp_model.body_invweight0)
+                substituted = (weights[..., :1] == weights[..., 1:]) & self._zero_invweight0
+                weights.masked_fill_(substituted, 0.0)
             # Bounds come from sizes again, which brings back what is hidden by its bounds.
             if self._absent is not None and "geom_rbound" in written:
                 hide_geoms(self.wp_model, self._absent)
-
-    def _restore_zero_invweights(self) -> None:
-        """Undo a substitution that MuJoCo does not make.
-
-        A body that only slides has no rotational inverse weight, and one that turns about its
-        centre of mass no translational one. Warp puts the other one in its place.
-        """
-        weights = as_torch(self.wp_model.body_invweight0)
-        substituted = (weights[..., :1] == weights[..., 1:]) & self._zero_invweight0
-        weights.masked_fill_(substituted, 0.0)
 
     def _rows_except(self, env_ids: torch.Tensor | None) -> torch.Tensor | None:
         """Return a mask (N,) of the environments that are not in `env_ids`; None if all are."""
@@ -528,10 +499,11 @@ class WarpEngine(Engine):
             poses = as_torch(getattr(self.wp_model, source))
             _set_rows(self.data_field(name), env_ids, poses[:, self._mocap_bodies])
         if self.mj_model.nhistory:
-            mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-            mask.fill_(True) if env_ids is None else mask.index_fill_(0, env_ids, True)
+            others = self._rows_except(env_ids)
+            chosen = None if others is None else ~others
             with self.ordered():
-                mjwarp.reset_history(self.wp_model, self.wp_data, reset=wp.from_torch(mask))
+                mask = None if chosen is None else wp.from_torch(chosen)
+                mjwarp.reset_history(self.wp_model, self.wp_data, reset=mask)
 
     def check_overflow(self) -> None:
         """Log now, once a kind, what exceeded its capacity so far. Waits for the GPU."""
@@ -616,11 +588,7 @@ class WarpEngine(Engine):
 
     def copy_to_host(self, env_idx: int, mj_data: mujoco.MjData) -> None:
         for name in _STATE_FIELDS:
-            value = self.data_field(name)[env_idx].cpu().numpy()
-            if name == "time":
-                mj_data.time = float(value)
-            else:
-                getattr(mj_data, name)[:] = value
+            setattr(mj_data, name, self.data_field(name)[env_idx].cpu().numpy())
 
     def state_dict(self) -> dict[str, Any]:
         tensors = {
@@ -676,17 +644,18 @@ def refuse_unsupported(model: mujoco.MjModel) -> None:
         if len(ids):
             names = [model.actuator(i).name or f"(id {i})" for i in ids]
             problems.append(f"the <{element}> actuators {names}; use {instead} instead")
-    known: dict[str, Any] = {"disable": mjwarp.DisableBit, "enable": mjwarp.EnableBit}
-    bits = {"disable": mujoco.mjtDisableBit, "enable": mujoco.mjtEnableBit}
-    for kind, supported in known.items():
-        flags = getattr(model.opt, f"{kind}flags")
+    for kind, known, bits in (
+        ("disable", mjwarp.DisableBit, mujoco.mjtDisableBit),
+        ("enable", mjwarp.EnableBit, mujoco.mjtEnableBit),
+    ):
         # Which environments sleep is no part of the state that is reset and saved here.
-        supported = {int(bit) for bit in supported if bit.name != "SLEEP"}
+        supported = sum(int(bit) for bit in known if bit.name != "SLEEP")
+        flags = getattr(model.opt, f"{kind}flags") & ~supported
         problems += [
             f"the {kind} flag {name[7:].lower()!r}; leave it out of MujocoCfg.{kind}flags and of "
             "the XML"
-            for name, bit in bits[kind].__members__.items()
-            if not name.startswith("mjN") and flags & int(bit) and int(bit) not in supported
+            for name, bit in bits.__members__.items()
+            if not name.startswith("mjN") and flags & int(bit)
         ]
     if problems:
         raise UnsupportedByWarpError(
@@ -720,16 +689,6 @@ def as_torch(array: Any) -> torch.Tensor:
         device = wp.device_to_torch(array.device)
         return torch.empty((*array.shape, *inner), dtype=scalar, device=device)
     return wp.to_torch(array)
-
-
-def _as_tensors(struct: Any) -> SimpleNamespace:
-    """View the arrays of a Warp struct as torch tensors."""
-    return SimpleNamespace(
-        **{
-            field.name: as_torch(getattr(struct, field.name))
-            for field in dataclasses.fields(struct)
-        }
-    )
 
 
 def offered_data_fields(data: Any) -> set[str]:
@@ -813,13 +772,9 @@ def expand_arrays(model: Any, nworld: int, names: list[str]) -> None:
         setattr(struct, attribute, own)
 
 
-@contextmanager
-def _torch_on_warps_stream(device: Any) -> Generator[None]:
-    if not device.is_cuda:
-        yield
-        return
-    with torch.cuda.stream(wp.stream_to_torch(device)):
-        yield
+def _torch_on_warps_stream(device: Any) -> AbstractContextManager[Any]:
+    stream = torch.cuda.stream
+    return stream(wp.stream_to_torch(device)) if device.is_cuda else nullcontext()
 
 
 def put_variant_model(model: mujoco.MjModel, nworld: int, values: VariantValues) -> Any:
@@ -867,26 +822,19 @@ def set_broadphase(wp_opt: Any, kind: str | None, filters: tuple[str, ...] | Non
     Raises:
         ValueError: an unknown name, with the known ones.
     """
+
+    def find(enum: Any, name: str, option: str) -> Any:
+        if name.upper() not in enum.__members__:
+            known = ", ".join(member.lower() for member in enum.__members__)
+            raise ValueError(f"SimulationCfg.{option} is {name!r}; choose from: {known}.")
+        return enum[name.upper()]
+
     if kind is not None:
-        wp_opt.broadphase = _member(mjwarp.BroadphaseType, kind, "broadphase")
+        wp_opt.broadphase = find(mjwarp.BroadphaseType, kind, "broadphase")
     if filters is not None:
-        bits = mjwarp.BroadphaseFilter(0)
-        for name in filters:
-            bits |= _member(mjwarp.BroadphaseFilter, name, "broadphase_filter")
-        wp_opt.broadphase_filter = bits
-
-
-def _member(enum: Any, name: str, option: str) -> Any:
-    if name.upper() not in enum.__members__:
-        known = ", ".join(member.lower() for member in enum.__members__)
-        raise ValueError(f"SimulationCfg.{option} is {name!r}; choose from: {known}.")
-    return enum[name.upper()]
-
-
-def _like_mujoco(name: str, array: Any) -> torch.Tensor:
-    """View an expanded model field in MuJoCo's shape."""
-    tensor = as_torch(array)
-    return tensor.flatten(-2) if name == "geom_aabb" else tensor
+        enum = mjwarp.BroadphaseFilter
+        bits = [find(enum, name, "broadphase_filter") for name in filters]
+        wp_opt.broadphase_filter = functools.reduce(operator.or_, bits, enum(0))
 
 
 def _set_rows(tensor: torch.Tensor, env_ids: torch.Tensor | None, values: torch.Tensor) -> None:
