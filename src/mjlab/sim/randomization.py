@@ -169,9 +169,6 @@ class VariantValues:
                 mask[part.absent_geoms] = True
         self.absent_geoms = absent[self._row]
         """(N, ngeom) bool: geoms that an environment does not have."""
-        self._owners = {
-            field: name for name in columns for part in columns[name] for field in part.fields
-        }
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -181,15 +178,6 @@ class VariantValues:
     def get(self, field: str) -> np.ndarray:
         """Return the values (N, ...) of one of `fields`, in MuJoCo's own type."""
         return self._values[field][self._row]
-
-    def describe_error(self, field: str, reason: object) -> str:
-        """Return the message for a field that an engine cannot hold per environment."""
-        entity = self._owners.get(field)
-        where = f"The variants of entity {entity!r}" if entity else "Environments with variants"
-        return (
-            f"{where} differ in the model field {field!r}, which this engine cannot hold per "
-            f"environment: {reason} Give all variants the same value, or use another engine."
-        )
 
 
 def _compute_values(

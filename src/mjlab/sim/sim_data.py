@@ -20,7 +20,7 @@ class TorchArray(torch.Tensor):
     refused when written by `[...] = ...`, because one row cannot hold different values.
     """
 
-    __torch_function__ = torch._C._disabled_torch_function_impl
+    __torch_function__ = torch._C._disabled_torch_function_impl  # ty: ignore[incompatible-method-override]
     _wp_array: Any
     _is_shared: bool
 

@@ -74,15 +74,20 @@ class SharedField(torch.Tensor):
     Writing one row would change every environment. Results of operations are plain tensors.
     """
 
-    field_name: str
-    is_structure: bool
+    error: str
 
     @classmethod
     def make(cls, value: torch.Tensor, nworld: int | None, name: str) -> SharedField:
         """View `value` as an (nworld, ...) field; as structure, in its own shape, if None."""
         view = value if nworld is None else value.expand(nworld, *value.shape)
         field = torch.Tensor._make_subclass(cls, view)
-        field.field_name, field.is_structure = name, nworld is None
+        field.error = f"Model field {name!r} is shared by all environments and cannot be written. "
+        field.error += (
+            "Change it in the spec or the model from which the Simulation is built."
+            if nworld is None
+            else f"Call sim.expand_model_fields(({name!r},)) first, or declare it with "
+            f"@requires_model_fields({name!r})."
+        )
         return field
 
     @classmethod
@@ -96,7 +101,7 @@ class SharedField(torch.Tensor):
         outputs = out if isinstance(out, tuple | list) else (out,)
         for tensor in (target, *outputs) if writes else outputs:
             if isinstance(tensor, SharedField):
-                tensor._raise()
+                raise RuntimeError(tensor.error)
         with torch._C.DisableTorchFunctionSubclass():
             result = func(*args, **(kwargs or {}))
         # Views still alias the shared value, so they stay protected.
@@ -108,20 +113,8 @@ class SharedField(torch.Tensor):
                 and result.untyped_storage().data_ptr() == target.untyped_storage().data_ptr()
             ):
                 result = result.as_subclass(cls)
-                result.field_name, result.is_structure = target.field_name, target.is_structure
+                result.error = target.error
         return result
-
-    def _raise(self) -> None:
-        name = self.field_name
-        raise RuntimeError(
-            f"Model field {name!r} is shared by all environments and cannot be written. "
-            + (
-                "Change it in the spec or the model from which the Simulation is built."
-                if self.is_structure
-                else f"Call sim.expand_model_fields(({name!r},)) first, or declare it with "
-                f"@requires_model_fields({name!r})."
-            )
-        )
 
 
 class Simulation:
@@ -169,19 +162,22 @@ class Simulation:
         self.num_envs = num_envs
         self.cfg = cfg
         self.device = device
-        self._mj_model = compile_spec(spec) if spec is not None else model
-        assert self._mj_model is not None
-        cfg.mujoco.apply(self._mj_model)
-        self._mj_data = mujoco.MjData(self._mj_model)
-        mujoco.mj_forward(self._mj_model, self._mj_data)
+        self.mj_model: mujoco.MjModel = compile_spec(spec) if spec is not None else model
+        """The compiled model on the host. Randomized values are not in it."""
+        cfg.mujoco.apply(self.mj_model)
+        self.mj_data = mujoco.MjData(self.mj_model)
+        """Host data of the compiled model, forwarded once at `qpos0`."""
+        mujoco.mj_forward(self.mj_model, self.mj_data)
         # Viewers write an environment's values into the host model, so the defaults that
         # randomization starts from are a snapshot.
-        self._default_model = copy.copy(self._mj_model)
+        self._default_model = copy.copy(self.mj_model)
         self._default_fields: dict[str, torch.Tensor] = {}
         self._variants: VariantValues | None = None
-        self._engine = create_engine(engine_name, self._mj_model, num_envs, cfg, device)
-        self._data = FieldView(self._engine.data_field, num_envs, "data")
-        self._model = FieldView(self._read_model_field, num_envs, "model")
+        self._engine = create_engine(engine_name, self.mj_model, num_envs, cfg, device)
+        self.data = FieldView(self._engine.data_field, num_envs, "data")
+        """Live `MjData` fields, (N, ...)."""
+        self.model = FieldView(self._read_model_field, num_envs, "model")
+        """Live `MjModel` fields; those not expanded are shared and read-only."""
         self._options = FieldView(self._read_option, num_envs, "model.opt")
         self._expanded: set[str] = set()
         if variant_info:
@@ -191,8 +187,8 @@ class Simulation:
         self.nan_guard = NanGuard(
             cfg.nan_guard,
             num_envs,
-            self._mj_model,
-            model_fields=lambda: {name: getattr(self._model, name) for name in self._expanded},
+            self.mj_model,
+            model_fields=lambda: {name: getattr(self.model, name) for name in self._expanded},
         )
         logger.debug("Physics: %s, %d environments.", self.capabilities.description, num_envs)
 
@@ -207,26 +203,6 @@ class Simulation:
     def engine_name(self) -> str:
         """`native` or `warp`."""
         return self.capabilities.name
-
-    @property
-    def data(self) -> FieldView:
-        """Live `MjData` fields, (N, ...)."""
-        return self._data
-
-    @property
-    def model(self) -> FieldView:
-        """Live `MjModel` fields; those not expanded are shared and read-only."""
-        return self._model
-
-    @property
-    def mj_model(self) -> mujoco.MjModel:
-        """The compiled model on the host. Randomized values are not in it."""
-        return self._mj_model
-
-    @property
-    def mj_data(self) -> mujoco.MjData:
-        """Host data of the compiled model, forwarded once at `qpos0`."""
-        return self._mj_data
 
     # Escape hatch of the Warp engine.
 
@@ -356,11 +332,11 @@ class Simulation:
             try:
                 self.expand_model_fields((name,))
             except ValueError as error:
-                raise ValueError(variants.describe_error(name, error)) from error
+                raise ValueError(f"Variants of an entity differ in {name!r}: {error}") from error
         # The mean inertia, which is not a field, scales the solver's tolerance.
         self.recompute_constants(3)
         for name in dict.fromkeys((*variants.fields, *derived)):
-            getattr(self._model, name).copy_(self.get_default_field(name))
+            getattr(self.model, name).copy_(self.get_default_field(name))
         if self.absent_geoms is not None:
             self._engine.hide_geoms(self.absent_geoms)
             self._expanded.update(COLLISION_MASKS)
@@ -382,7 +358,7 @@ class Simulation:
             self.get_default_field(name)
         self._engine.expand(new)
         self._expanded.update(new)
-        self._model.forget(new)
+        self.model.forget(new)
         self._options.forget(new)
 
     def recompute_constants(self, level: RecomputeLevel | int, env_ids: EnvIds = None) -> None:
@@ -408,7 +384,7 @@ class Simulation:
             return self._engine.step(nstep, record)
         recorded = []
         for _ in range(nstep):
-            with self.nan_guard.watch(self._data):
+            with self.nan_guard.watch(self.data):
                 recorded.append(self._engine.step(1, record))
         return {name: torch.cat([step[name] for step in recorded]) for name in record}
 
@@ -511,7 +487,7 @@ class Simulation:
 
     def copy_to_host(self, env_idx: int, mj_data: mujoco.MjData | None = None) -> mujoco.MjData:
         """Copy the state of one environment into host data, for viewers; runs no forward pass."""
-        mj_data = self._mj_data if mj_data is None else mj_data
+        mj_data = self.mj_data if mj_data is None else mj_data
         self._engine.copy_to_host(env_idx, mj_data)
         return mj_data
 

@@ -10,7 +10,6 @@ The first use on a machine compiles the kernels (minutes); afterwards they come 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import gc
 import logging
@@ -45,6 +44,7 @@ from mjlab.sim.warp.overflow import OverflowWatch
 from mjlab.sim.warp.rays import WarpRays
 from mjlab.sim.warp.render import WarpRenderer
 from mjlab.utils.lab_api.math import matrix_from_quat, matrix_product
+from mjlab.utils.string import name_list
 
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
@@ -356,8 +356,6 @@ class WarpEngine(Engine):
         return tuple(name for name in names if getattr(self.wp_model, name).size)
 
     def recompute_constants(self, level: int, env_ids: torch.Tensor | None) -> None:
-        if level not in _RECOMPUTE:
-            raise ValueError(f"Unknown recompute level {level}; it is one of 1, 2 and 3.")
         written = self.constants_written_by(level)
         self.expand(written)
         others = self._rows_except(env_ids)
@@ -387,10 +385,9 @@ class WarpEngine(Engine):
     def step(self, nstep: int, record: tuple[str, ...] = ()) -> dict[str, torch.Tensor]:
         fields = {name: self.data_field(name) for name in record}
         recorded = {name: field.new_empty(nstep, *field.shape) for name, field in fields.items()}
-        if not record:
-            self.launch("step", self._substep, nstep)
-        for k in range(nstep if record else 0):
-            self.launch("step", self._substep)
+        launches = nstep if record else 1
+        for k in range(launches):
+            self.launch("step", self._substep, nstep // launches)
             for name, field in fields.items():
                 recorded[name][k] = field
         self._overflow.tick()
@@ -712,7 +709,8 @@ def find_data_field(data: Any, name: str) -> Any:
             "those of all environments together from sim.data.nacon and sim.data.contact."
         )
     raise AttributeError(
-        f"The warp engine has no per-environment MjData field {name!r}." + _hint(name, known)
+        f"The warp engine has no per-environment MjData field {name!r}. Available: "
+        f"{name_list(sorted(known), near=(name,))}."
     )
 
 
@@ -724,9 +722,8 @@ def find_model_field(model: Any, name: str) -> tuple[Any, str]:
     Raises:
         ValueError: no such field, or one that cannot differ between environments.
     """
-    prefix, _, attribute = name.rpartition(".")
-    structs = {"": (model, model.opt), "opt": (model.opt,)}
-    for struct in structs.get(prefix, ()):
+    attribute = name.removeprefix("opt.")
+    for struct in (model, model.opt):
         if attribute in _fields_over(type(struct), "*"):
             return struct, attribute
     if hasattr(mujoco.MjModel, attribute) or hasattr(mujoco.MjOption, attribute):
@@ -734,9 +731,8 @@ def find_model_field(model: Any, name: str) -> tuple[Any, str]:
             f"MuJoCo Warp shares model field {name!r} between all environments; it cannot differ. "
             "Set it in the model instead, or use --engine native."
         )
-    raise ValueError(
-        f"MjModel has no field {name!r}." + _hint(name, _fields_over(type(model), "*"))
-    )
+    known = sorted(_fields_over(type(model), "*"))
+    raise ValueError(f"MjModel has no field {name!r}. Available: {name_list(known, near=(name,))}.")
 
 
 def _fields_over(struct: type[Any], dimension: str) -> set[str]:
@@ -746,11 +742,6 @@ def _fields_over(struct: type[Any], dimension: str) -> set[str]:
         for field in dataclasses.fields(struct)
         if (getattr(field.type, "shape", None) or (None,))[0] == dimension
     }
-
-
-def _hint(name: str, known: set[str]) -> str:
-    close = difflib.get_close_matches(name, sorted(known), n=3)
-    return f" Close names: {', '.join(close)}." if close else ""
 
 
 def expand_arrays(model: Any, nworld: int, names: list[str]) -> None:

@@ -45,9 +45,21 @@ class WarpRenderer:
 
         `expanded` are the names of the model fields that differ between environments.
         """
+        by_settings: dict[Any, dict[int, CameraView]] = {}
+        for i, view in enumerate(views):
+            settings = (view.geom_groups, view.use_textures, view.use_shadows)
+            by_settings.setdefault(settings, {})[i] = view
         images: dict[int, Images] = {}
-        for scene in self._scenes_of(views, expanded):
-            images.update(scene.render())
+        relevant = expanded & _CONTEXT_FIELDS
+        for settings, members in by_settings.items():
+            scene = self._scenes.get((views, settings))
+            if scene is None or scene.expanded != relevant:
+                name = f"render {next(self._numbers)}"
+                # Images that are made here are written into in later calls, in whatever mode.
+                with self._engine.ordered(), torch.inference_mode(False):
+                    scene = _Scene(self._engine, members, relevant, name)
+                self._scenes[views, settings] = scene
+            images |= scene.render()
         return [images[i] for i in range(len(views))]
 
     def context_of(self, views: tuple[CameraView, ...], view: CameraView) -> Any:
@@ -56,24 +68,6 @@ class WarpRenderer:
             if key[0] == views and view in scene.views.values():
                 return scene.context
         raise RuntimeError("The view has not been rendered yet; call Simulation.sense() first.")
-
-    def _scenes_of(self, views: tuple[CameraView, ...], expanded: frozenset[str]) -> list[_Scene]:
-        by_settings: dict[Any, dict[int, CameraView]] = {}
-        for i, view in enumerate(views):
-            settings = (view.geom_groups, view.use_textures, view.use_shadows)
-            by_settings.setdefault(settings, {})[i] = view
-        scenes = []
-        relevant = expanded & _CONTEXT_FIELDS
-        for settings, members in by_settings.items():
-            key = (views, settings)
-            if key not in self._scenes or self._scenes[key].expanded != relevant:
-                # Images that are made here are written into in later calls, in whatever mode.
-                with self._engine.ordered(), torch.inference_mode(False):
-                    self._scenes[key] = _Scene(
-                        self._engine, members, relevant, f"render {next(self._numbers)}"
-                    )
-            scenes.append(self._scenes[key])
-        return scenes
 
 
 class _Scene:
