@@ -332,7 +332,10 @@ class Simulation:
             try:
                 self.expand_model_fields((name,))
             except ValueError as error:
-                raise ValueError(f"Variants of an entity differ in {name!r}: {error}") from error
+                names = ", ".join(repr(entity) for entity, _ in info)
+                raise ValueError(
+                    f"The variants of entity {names} differ in the model field {name!r}: {error}"
+                ) from error
         # The mean inertia, which is not a field, scales the solver's tolerance.
         self.recompute_constants(3)
         for name in dict.fromkeys((*variants.fields, *derived)):

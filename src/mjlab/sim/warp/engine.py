@@ -86,6 +86,9 @@ _NO_RAYS = (
 # A geom that is welded to the world moves only if one of these is changed.
 _STATIC_POSE = frozenset({"body_pos", "body_quat", "geom_pos", "geom_quat"})
 
+# Made once for each stream.
+_as_warp_stream = functools.cache(wp.stream_from_torch)
+
 _RECOMPUTE = {1: mjwarp.set_const_fixed, 2: mjwarp.set_const_0, 3: mjwarp.set_const}
 
 
@@ -130,7 +133,6 @@ class WarpEngine(Engine):
         )
         # MuJoCo leaves these at zero; Warp fills them up when it recomputes constants.
         self._zero_invweight0 = torch.as_tensor(model.body_invweight0 == 0, device=device)
-        self._torch_streams: dict[int, Any] = {}
         with self.ordered():
             self._allocate(model, cfg)
         cfg.apply_wp_opt(self.wp_model.opt)
@@ -139,8 +141,8 @@ class WarpEngine(Engine):
         self._graphs: dict[str, Any] = {}
         self._warned_of_capture = False
         self._absent: torch.Tensor | None = None
-        self._rays: WarpRays | None = None
-        self._renderer: WarpRenderer | None = None
+        self._rays = WarpRays(self)
+        self._renderer = WarpRenderer(self)
         self._eq_active0 = torch.as_tensor(model.eq_active0.astype(bool), device=self.device)
         mocap = np.flatnonzero(model.body_mocapid >= 0)
         mocap = mocap[np.argsort(model.body_mocapid[mocap])]
@@ -229,11 +231,7 @@ class WarpEngine(Engine):
             if not self._on_cuda:
                 yield
                 return
-            stream = torch.cuda.current_stream(self.device)
-            # As Warp sees it; made once for each.
-            if stream.cuda_stream not in self._torch_streams:
-                self._torch_streams[stream.cuda_stream] = wp.stream_from_torch(stream)
-            torch_stream = self._torch_streams[stream.cuda_stream]
+            torch_stream = _as_warp_stream(torch.cuda.current_stream(self.device))
             self.wp_device.stream.wait_stream(torch_stream)
             yield
             torch_stream.wait_stream(self.wp_device.stream)
@@ -478,10 +476,8 @@ class WarpEngine(Engine):
         frames = self.data_field("xmat")[:, bodies]
         positions = as_torch(self.wp_model.geom_pos)[:, geoms]
         rotations = matrix_from_quat(as_torch(self.wp_model.geom_quat)[:, geoms])
-        # Sums, because products of matrices may be rounded to TF32.
-        self.data_field("geom_xpos")[:, geoms] = self.data_field("xpos")[:, bodies] + (
-            frames * positions[..., None, :]
-        ).sum(dim=-1)
+        offsets = matrix_product(frames, positions[..., None])[..., 0]
+        self.data_field("geom_xpos")[:, geoms] = self.data_field("xpos")[:, bodies] + offsets
         self.data_field("geom_xmat")[:, geoms] = matrix_product(frames, rotations)
 
     def reset(self, env_ids: torch.Tensor | None) -> None:
@@ -490,11 +486,17 @@ class WarpEngine(Engine):
         for name in (*ZERO_INPUTS, *_RESULTS_ZERO_ON_RESET):
             tensor = self.data_field(name)
             tensor.zero_() if env_ids is None else tensor.index_fill_(0, env_ids, 0)
-        _set_rows(self.data_field("qpos"), env_ids, as_torch(self.wp_model.qpos0))
-        _set_rows(self.data_field("eq_active"), env_ids, self._eq_active0[None])
-        for name, source in (("mocap_pos", "body_pos"), ("mocap_quat", "body_quat")):
-            poses = as_torch(getattr(self.wp_model, source))
-            _set_rows(self.data_field(name), env_ids, poses[:, self._mocap_bodies])
+        model, mocap = self.wp_model, self._mocap_bodies
+        starts = {
+            "qpos": as_torch(model.qpos0),
+            "eq_active": self._eq_active0[None],
+            "mocap_pos": as_torch(model.body_pos)[:, mocap],
+            "mocap_quat": as_torch(model.body_quat)[:, mocap],
+        }
+        rows = slice(None) if env_ids is None else env_ids
+        for name, values in starts.items():
+            tensor = self.data_field(name)
+            tensor[rows] = values.expand(tensor.shape)[rows]
         if self.mj_model.nhistory:
             others = self._rows_except(env_ids)
             chosen = None if others is None else ~others
@@ -537,8 +539,6 @@ class WarpEngine(Engine):
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         if self.capabilities.raycast_problem is not None:
             raise UnsupportedByWarpError(self.capabilities.raycast_problem)
-        if self._rays is None:
-            self._rays = WarpRays(self)
         distances, normals, geom_ids = self._rays.cast(
             origins, directions, geom_groups, exclude_body_ids
         )
@@ -552,14 +552,10 @@ class WarpEngine(Engine):
         )
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:
-        if self._renderer is None:
-            self._renderer = WarpRenderer(self)
-        return self._renderer.render(views, frozenset(self._model_tensors))
+        return self._renderer.render(views)
 
     def render_context(self, views: tuple[CameraView, ...], view: CameraView) -> Any:
         """Return the `mujoco_warp.RenderContext` of a view, one of `views` rendered together."""
-        if self._renderer is None:
-            raise RuntimeError("Nothing has been rendered yet; call Simulation.sense() first.")
         return self._renderer.context_of(views, view)
 
     def jacobian(
@@ -828,15 +824,6 @@ def set_broadphase(wp_opt: Any, kind: str | None, filters: tuple[str, ...] | Non
         wp_opt.broadphase_filter = functools.reduce(operator.or_, bits, enum(0))
 
 
-def _set_rows(tensor: torch.Tensor, env_ids: torch.Tensor | None, values: torch.Tensor) -> None:
-    """Write `values`, of one row or of one a row of `tensor`, into the rows `env_ids`."""
-    rows = values.expand(tensor.shape)
-    if env_ids is None:
-        tensor.copy_(rows)
-    else:
-        tensor.index_copy_(0, env_ids, rows.index_select(0, env_ids))
-
-
 def _find_device(device: torch.device) -> Any:
     if device.type not in ("cpu", "cuda"):
         raise EngineUnavailableError(
@@ -845,15 +832,14 @@ def _find_device(device: torch.device) -> Any:
     wp.init()
     if device.type == "cpu":
         return wp.get_device("cpu")
-    if not wp.is_cuda_available() or not torch.cuda.is_available():
+    count = wp.get_cuda_device_count() if torch.cuda.is_available() else 0
+    index = device.index or 0
+    if device.index is None and count:
+        index = torch.cuda.current_device()
+    if index >= count:
+        usable = ", ".join(["cpu", *(f"cuda:{i}" for i in range(count))])
         raise EngineUnavailableError(
-            f"Device {str(device)!r} needs an NVIDIA GPU, and none is usable here. "
-            "Use --device cpu (with --engine native, which is faster there)."
-        )
-    index = torch.cuda.current_device() if device.index is None else device.index
-    if index >= wp.get_cuda_device_count():
-        raise EngineUnavailableError(
-            f"There is no device cuda:{index}; this machine has cuda:0 to "
-            f"cuda:{wp.get_cuda_device_count() - 1}."
+            f"Device {str(device)!r} needs an NVIDIA GPU that is not usable here; available: "
+            f"{usable}. Use --device cpu (with --engine native, which is faster there)."
         )
     return wp.get_cuda_device(index)

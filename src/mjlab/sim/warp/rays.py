@@ -10,9 +10,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import mujoco_warp
-import numpy as np
 import torch
 import warp
+
+from mjlab.sim.engine import NUM_GEOM_GROUPS, rendered_geoms
 
 if TYPE_CHECKING:
     from mjlab.sim.warp.engine import WarpEngine
@@ -40,14 +41,12 @@ class WarpRays:
 
         They are overwritten by the next call with as many rays into the same groups.
         """
-        # MuJoCo counts a group beyond 0 to 5 as the nearest of these.
-        present = np.unique(self._engine.mj_model.geom_group)
-        if geom_groups is not None:
-            present = present[np.isin(present.clip(0, 5), geom_groups)]
-        groups = tuple(present.tolist())
-        key = (groups, origins.shape[1])
+        key = (geom_groups, origins.shape[1])
         if key not in self._queries:
-            self._queries[key] = _Query(*origins.shape[:2], origins.device)
+            model = self._engine.mj_model
+            groups = tuple(range(NUM_GEOM_GROUPS)) if geom_groups is None else geom_groups
+            present = {int(model.geom_group[geom]) for geom in rendered_geoms(model, groups)}
+            self._queries[key] = _Query(origins, sorted(present))
         query = self._queries[key]
         query.origins.copy_(origins)
         query.directions.copy_(directions)
@@ -55,11 +54,11 @@ class WarpRays:
             query.excluded.fill_(-1)
         else:
             query.excluded.copy_(exclude_body_ids)
-        if groups:
-            self._engine.launch(f"rays {key}", lambda: self._run(query, groups), on_cpu=False)
+        if query.groups:
+            self._engine.launch(f"rays {key}", lambda: self._run(query), on_cpu=False)
         return query.distances, query.normals, query.geom_ids
 
-    def _run(self, query: _Query, groups: tuple[int, ...]) -> None:
+    def _run(self, query: _Query) -> None:
         model, data = self._engine.wp_model, self._engine.wp_data
         if query.context is None:
             query.context = mjwarp.create_render_context(
@@ -67,7 +66,7 @@ class WarpRays:
                 data.nworld,
                 cam_active=[],
                 use_textures=False,
-                enabled_geom_groups=list(groups),
+                enabled_geom_groups=query.groups,
             )
         mjwarp.refit_bvh(model, data, query.context)
         mjwarp.rays(
@@ -90,13 +89,11 @@ class _Query:
     """Memory of R rays in each of N worlds, at the addresses that a graph was captured with."""
 
     @torch.inference_mode(False)
-    def __init__(self, num_worlds: int, num_rays: int, device: torch.device) -> None:
-        real: Any = {"dtype": torch.float32, "device": device}
-        whole: Any = {"dtype": torch.int32, "device": device}
-        self.origins = torch.zeros(num_worlds, num_rays, 3, **real)
-        self.directions = torch.zeros(num_worlds, num_rays, 3, **real)
-        self.excluded = torch.zeros(num_rays, **whole)
-        self.distances = torch.full((num_worlds, num_rays), -1.0, **real)
-        self.normals = torch.zeros(num_worlds, num_rays, 3, **real)
-        self.geom_ids = torch.full((num_worlds, num_rays), -1, **whole)
+    def __init__(self, origins: torch.Tensor, groups: list[int]) -> None:
+        self.groups = groups
         self.context: Any = None
+        self.origins = torch.zeros_like(origins, dtype=torch.float32).contiguous()
+        self.directions, self.normals = self.origins.clone(), self.origins.clone()
+        self.distances = torch.full_like(self.origins[..., 0], -1.0)
+        self.geom_ids = torch.full_like(self.distances, -1, dtype=torch.int32)
+        self.excluded = torch.zeros_like(self.geom_ids[0])

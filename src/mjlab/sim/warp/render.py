@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import warp
 
-from mjlab.sim.engine import LENS_FIELDS, CameraView, Images
+from mjlab.sim.engine import LENS_FIELDS, CameraView, Images, rendered_geoms
 
 if TYPE_CHECKING:
     from mjlab.sim.warp.engine import WarpEngine
@@ -40,17 +40,14 @@ class WarpRenderer:
         # A graph's name is used once, so that none is replayed for another context.
         self._numbers = itertools.count()
 
-    def render(self, views: tuple[CameraView, ...], expanded: frozenset[str]) -> list[Images]:
-        """Render views at the poses that derived fields have; see `Engine.render`.
-
-        `expanded` are the names of the model fields that differ between environments.
-        """
+    def render(self, views: tuple[CameraView, ...]) -> list[Images]:
+        """Render views at the poses that derived fields have; see `Engine.render`."""
         by_settings: dict[Any, dict[int, CameraView]] = {}
         for i, view in enumerate(views):
             settings = (view.geom_groups, view.use_textures, view.use_shadows)
             by_settings.setdefault(settings, {})[i] = view
         images: dict[int, Images] = {}
-        relevant = expanded & _CONTEXT_FIELDS
+        relevant = frozenset(filter(self._engine.is_expanded, _CONTEXT_FIELDS))
         for settings, members in by_settings.items():
             scene = self._scenes.get((views, settings))
             if scene is None or scene.expanded != relevant:
@@ -82,44 +79,36 @@ class _Scene:
     ) -> None:
         self.views, self.expanded = views, expanded
         self._engine, self._name = engine, name
-        host = engine.mj_model
-        members = list(views.values())
-        first = members[0]
-        # MuJoCo counts a group beyond 0 to 5 as the nearest of these.
-        groups = np.unique(host.geom_group)
-        groups = groups[np.isin(groups.clip(0, 5), first.geom_groups)]
-        self.context = None
-        if len(groups):
-            self.context = self._make_context(members, groups.tolist())
+        host, cameras = engine.mj_model, list(views.values())
+        first = cameras[0]
+        self.context: Any = None
         self._dataid: Any = None
-        if "geom_dataid" in expanded and self.context is not None:
-            self._dataid = _without_absent_meshes(host, engine.wp_model, self.context)
+        shown = rendered_geoms(host, first.geom_groups)
+        if shown:
+            self.context = mjwarp.create_render_context(
+                host,
+                engine.num_envs,
+                cam_res=[(view.width, view.height) for view in cameras],
+                render_rgb=["rgb" in view.data_types for view in cameras],
+                render_depth=["depth" in view.data_types for view in cameras],
+                render_seg=["segmentation" in view.data_types for view in cameras],
+                cam_active=[view.camera_id for view in cameras],
+                use_textures=first.use_textures,
+                use_shadows=first.use_shadows,
+                enabled_geom_groups=np.unique(host.geom_group[shown]).tolist(),
+                render_skybox=True,
+                use_precomputed_rays=LENS_FIELDS.isdisjoint(expanded),
+                # Faces of meshes are flat on both engines; rays of MuJoCo know no others.
+                enable_vertex_normals=False,
+            )
+            # The model says what may be left out; environments may differ from it.
+            if "light_attenuation" in expanded:
+                self.context.light_attenuation_is_default = False
+            if "light_type" in expanded:
+                self.context.has_spot_lights = True
+            if "geom_dataid" in expanded:
+                self._dataid = _without_absent_meshes(host, engine.wp_model, self.context)
         self._images = self._read_images(engine.num_envs)
-
-    def _make_context(self, views: list[CameraView], groups: list[int]) -> Any:
-        first = views[0]
-        context = mjwarp.create_render_context(
-            self._engine.mj_model,
-            self._engine.num_envs,
-            cam_res=[(view.width, view.height) for view in views],
-            render_rgb=["rgb" in view.data_types for view in views],
-            render_depth=["depth" in view.data_types for view in views],
-            render_seg=["segmentation" in view.data_types for view in views],
-            cam_active=[view.camera_id for view in views],
-            use_textures=first.use_textures,
-            use_shadows=first.use_shadows,
-            enabled_geom_groups=groups,
-            render_skybox=True,
-            use_precomputed_rays=LENS_FIELDS.isdisjoint(self.expanded),
-            # Faces of meshes are flat on both engines; rays of MuJoCo know no others.
-            enable_vertex_normals=False,
-        )
-        # The model says what may be left out; environments may differ from it.
-        if "light_attenuation" in self.expanded:
-            context.light_attenuation_is_default = False
-        if "light_type" in self.expanded:
-            context.has_spot_lights = True
-        return context
 
     def _read_images(self, num_worlds: int) -> dict[int, Images]:
         """View the context's buffers as images. Colours are packed there, and get their own."""
