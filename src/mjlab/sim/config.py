@@ -62,31 +62,34 @@ class MujocoCfg:
         Raises:
             ValueError: an option or flag that MuJoCo does not know, with those it does.
         """
+        import mujoco
+
         for option in fields(MujocoCfg):
             name, value = option.name, getattr(self, option.name)
-            if name.endswith("flags"):
-                for flag in value:
-                    if flag not in ALWAYS_ENABLED_FLAGS or name == "disableflags":
-                        bits = getattr(model.opt, name) | _enum_value(name, flag)
-                        setattr(model.opt, name, bits)
-            else:
-                setattr(model.opt, name, _enum_value(name, value) if name in _ENUMS else value)
+            if name in _ENUMS:
+                enum_name, prefix = _ENUMS[name]
+                enum = getattr(mujoco, enum_name)
+                if name.endswith("flags"):
+                    bits = getattr(model.opt, name)
+                    for flag in value:
+                        if name == "disableflags" or flag not in ALWAYS_ENABLED_FLAGS:
+                            bits |= _enum_value(f"MujocoCfg.{name}", enum, flag, prefix)
+                    value = bits
+                else:
+                    value = _enum_value(f"MujocoCfg.{name}", enum, value, prefix)
+            setattr(model.opt, name, value)
 
 
-def _enum_value(option: str, name: str) -> Any:
-    """Return MuJoCo's enum member for a lower-case name, or raise listing the valid names."""
-    import mujoco
-
-    enum_name, prefix = _ENUMS[option]
+def _enum_value(option: str, enum: Any, name: str, prefix: str = "") -> Any:
+    """Return an enum's member for a lower-case name, or raise listing the valid names."""
     members = {
         member[len(prefix) :].lower(): value
-        for member, value in getattr(mujoco, enum_name).__members__.items()
+        for member, value in enum.__members__.items()
         if member.startswith(prefix)
     }
     if name not in members:
         raise ValueError(
-            f"MujocoCfg.{option}: {name!r} is not known to MuJoCo. Choose from: "
-            f"{', '.join(sorted(members))}."
+            f"{option}: {name!r} is not known to MuJoCo. Choose from: {', '.join(members)}."
         )
     return members[name]
 
@@ -129,7 +132,13 @@ class SimulationCfg:
                 stacklevel=2,
             )
         wp_opt.contact_sensor_maxmatch = self.contact_sensor_maxmatch
-        if self.broadphase is not None or self.broadphase_filter is not None:
-            from mjlab.sim.warp.engine import set_broadphase
-
-            set_broadphase(wp_opt, self.broadphase, self.broadphase_filter)
+        if self.broadphase is not None:
+            kinds = type(wp_opt.broadphase)
+            wp_opt.broadphase = _enum_value("SimulationCfg.broadphase", kinds, self.broadphase)
+        if self.broadphase_filter is not None:
+            bits = type(wp_opt.broadphase_filter)
+            wp_opt.broadphase_filter = bits(0)
+            for name in self.broadphase_filter:
+                wp_opt.broadphase_filter |= _enum_value(
+                    "SimulationCfg.broadphase_filter", bits, name
+                )

@@ -366,6 +366,9 @@ class Engine(ABC):
         acceleration stage as they were saved. `check_state` accepts `state`.
         """
 
+    def create_graph(self) -> None:  # noqa: B027 - optional hook: the native engine captures none.
+        """Capture graphs again, after memory that they use was replaced."""
+
     def close(self) -> None:  # noqa: B027 - optional hook: most engines hold nothing to free.
         """Free what the engine holds outside Python's reach."""
 
@@ -404,15 +407,8 @@ def create_engine(
     """Build the engine called `name` (a result of `resolve_engine_name`).
 
     Raises:
-        EngineUnavailableError: its package is missing or it cannot run on this machine.
+        EngineUnavailableError: it cannot run on this machine.
     """
     module_name, class_name = _ENGINES[name]
-    try:
-        module = importlib.import_module(module_name)
-    except ImportError as error:
-        other = "warp" if name == "native" else "native"
-        raise EngineUnavailableError(
-            f"The {name} engine cannot be loaded: {error}. Install the missing package "
-            f"(mjlab depends on it by default), or use --engine {other}."
-        ) from error
+    module = importlib.import_module(module_name)
     return getattr(module, class_name)(model, num_envs, cfg, device)

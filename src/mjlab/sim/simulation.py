@@ -287,10 +287,8 @@ class Simulation:
             value = self._host_value(field)
             if self._variants is not None and field in self._variants.fields:
                 value = self._variants.get(field)
-            array = np.array(value)
-            if array.dtype == np.float64:
-                array = array.astype(np.float32)
-            tensor = _reshape_rows(field, torch.from_numpy(array))
+            tensor = _reshape_rows(field, torch.from_numpy(np.array(value)))
+            tensor = tensor.float() if tensor.is_floating_point() else tensor
             self._default_fields[field] = tensor.to(self.device)
         return self._default_fields[field]
 
@@ -446,9 +444,7 @@ class Simulation:
 
     def create_graph(self) -> None:
         """Capture the step anew where the engine captures one (Warp on CUDA); else nothing."""
-        capture = getattr(self._engine, "create_graph", None)
-        if capture is not None:
-            capture()
+        self._engine.create_graph()
 
     # Queries.
 
@@ -523,19 +519,13 @@ class Simulation:
 
     def resolve_ids(self, env_ids: EnvIds) -> torch.Tensor | None:
         """Return `env_ids` as the engine takes them: None, or int64, on a CPU sorted and unique."""
-        if env_ids is None:
+        if env_ids is None or (isinstance(env_ids, slice) and env_ids == slice(None)):
             return None
-        if isinstance(env_ids, slice):
-            if env_ids == slice(None):
-                return None
-            return torch.arange(self.num_envs, device=self.device)[env_ids].sort().values
-        if env_ids.dtype == torch.bool:
-            return env_ids.nonzero().flatten()
+        if isinstance(env_ids, slice) or env_ids.dtype == torch.bool:
+            env_ids = torch.arange(self.num_envs, device=self.device)[env_ids]
         env_ids = env_ids.to(self.device, torch.int64)
         # To sort them, the host would have to wait for a GPU.
-        if env_ids.is_cuda or env_ids.numel() < 2:
-            return env_ids
-        return torch.unique(env_ids, sorted=True)
+        return env_ids if env_ids.is_cuda or len(env_ids) < 2 else env_ids.unique()
 
 
 def _reshape_rows(field: str, tensor: torch.Tensor) -> torch.Tensor:

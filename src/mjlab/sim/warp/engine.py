@@ -13,7 +13,6 @@ import dataclasses
 import functools
 import gc
 import logging
-import operator
 import os
 from collections.abc import Callable, Generator, Sequence, Set
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -139,7 +138,7 @@ class WarpEngine(Engine):
         self._data_tensors: dict[str, torch.Tensor] = {}
         self._model_tensors: dict[str, torch.Tensor] = {}
         self._graphs: dict[str, Any] = {}
-        self._warned_of_capture = False
+        self._captures = True
         self._absent: torch.Tensor | None = None
         self._rays = WarpRays(self)
         self._renderer = WarpRenderer(self)
@@ -250,7 +249,8 @@ class WarpEngine(Engine):
                 if self._on_cuda:
                     work()
                     times -= 1
-                self._graphs[name] = self._capture(work) if self._on_cuda or on_cpu else None
+                is_captured = self._captures and (self._on_cuda or on_cpu)
+                self._graphs[name] = self._capture(work) if is_captured else None
             graph = self._graphs[name]
             for _ in range(times):
                 work() if graph is None else wp.capture_launch(graph)
@@ -265,12 +265,11 @@ class WarpEngine(Engine):
                 work()
             return capture.graph
         except RuntimeError as error:
-            if not self._warned_of_capture:
-                self._warned_of_capture = True
-                logger.warning(
-                    "Warp captures no graph here, so that kernels are launched one by one, which "
-                    "is slower: %s", error,
-                )  # fmt: skip
+            self._captures = False
+            logger.warning(
+                "Warp captures no graph here, so that kernels are launched one by one, which is "
+                "slower: %s", error,
+            )  # fmt: skip
             return None
         finally:
             if collects:
@@ -323,10 +322,9 @@ class WarpEngine(Engine):
     def expand(self, fields: tuple[str, ...]) -> None:
         new = [name for name in dict.fromkeys(fields) if name not in self._model_tensors]
         with self.ordered():
-            expand_arrays(self.wp_model, self.num_envs, new)
-        for name in new:
-            struct, attribute = find_model_field(self.wp_model, name)
-            tensor = as_torch(getattr(struct, attribute))
+            arrays = expand_arrays(self.wp_model, self.num_envs, new)
+        for name, array in zip(new, arrays, strict=True):
+            tensor = as_torch(array)
             # MuJoCo stores centers and half sizes in one row.
             self._model_tensors[name] = tensor.flatten(-2) if name == "geom_aabb" else tensor
         # A graph keeps the addresses of the arrays it was captured with.
@@ -561,20 +559,14 @@ class WarpEngine(Engine):
     def jacobian(
         self, points: torch.Tensor, body_ids: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        shape = (self.num_envs, 3, self.mj_model.nv)
-        translational = torch.empty(shape, dtype=torch.float32, device=self.device)
-        rotational = torch.empty_like(translational)
+        shape = (2, self.num_envs, 3, self.mj_model.nv)
+        translational, rotational = torch.empty(shape, device=self.device)
         # Copied before Warp's stream starts to wait for torch's, which it does only once.
         points, body_ids = points.float().contiguous(), body_ids.to(torch.int32).contiguous()
         with self.ordered():
-            mjwarp.jac(
-                self.wp_model,
-                self.wp_data,
-                wp.from_torch(translational),
-                wp.from_torch(rotational),
-                wp.from_torch(points, dtype=wp.vec3),
-                wp.from_torch(body_ids),
-            )
+            point, body = wp.from_torch(points, dtype=wp.vec3), wp.from_torch(body_ids)
+            outputs = wp.from_torch(translational), wp.from_torch(rotational)
+            mjwarp.jac(self.wp_model, self.wp_data, *outputs, point, body)
         return translational, rotational
 
     # Copies.
@@ -740,8 +732,11 @@ def _fields_over(struct: type[Any], dimension: str) -> set[str]:
     }
 
 
-def expand_arrays(model: Any, nworld: int, names: list[str]) -> None:
+def expand_arrays(model: Any, nworld: int, names: list[str]) -> list[Any]:
     """Give each of `nworld` worlds its own row of fields of a `mujoco_warp.Model`, in place.
+
+    Returns:
+        The arrays of the fields.
 
     Raises:
         ValueError: a field that does not exist or that MuJoCo Warp cannot hold per world.
@@ -757,6 +752,7 @@ def expand_arrays(model: Any, nworld: int, names: list[str]) -> None:
                 as_torch(own).copy_(as_torch(shared).expand(nworld, *as_torch(shared).shape[1:]))
         own._is_batched = True
         setattr(struct, attribute, own)
+    return [getattr(struct, attribute) for struct, attribute in found]
 
 
 def _torch_on_warps_stream(device: Any) -> AbstractContextManager[Any]:
@@ -803,43 +799,17 @@ def hide_geoms(model: Any, absent: torch.Tensor) -> None:
     centres.copy_(torch.where(absent[..., None], places[:, None], centres))
 
 
-def set_broadphase(wp_opt: Any, kind: str | None, filters: tuple[str, ...] | None) -> None:
-    """Write `SimulationCfg.broadphase` and `broadphase_filter` onto `mujoco_warp`'s options.
-
-    Raises:
-        ValueError: an unknown name, with the known ones.
-    """
-
-    def find(enum: Any, name: str, option: str) -> Any:
-        if name.upper() not in enum.__members__:
-            known = ", ".join(member.lower() for member in enum.__members__)
-            raise ValueError(f"SimulationCfg.{option} is {name!r}; choose from: {known}.")
-        return enum[name.upper()]
-
-    if kind is not None:
-        wp_opt.broadphase = find(mjwarp.BroadphaseType, kind, "broadphase")
-    if filters is not None:
-        enum = mjwarp.BroadphaseFilter
-        bits = [find(enum, name, "broadphase_filter") for name in filters]
-        wp_opt.broadphase_filter = functools.reduce(operator.or_, bits, enum(0))
-
-
 def _find_device(device: torch.device) -> Any:
-    if device.type not in ("cpu", "cuda"):
-        raise EngineUnavailableError(
-            f"The warp engine runs on cuda or cpu devices, not on {str(device)!r}."
-        )
     wp.init()
     if device.type == "cpu":
         return wp.get_device("cpu")
-    count = wp.get_cuda_device_count() if torch.cuda.is_available() else 0
-    index = device.index or 0
-    if device.index is None and count:
-        index = torch.cuda.current_device()
+    is_usable = device.type == "cuda" and torch.cuda.is_available()
+    count = wp.get_cuda_device_count() if is_usable else 0
+    index = torch.cuda.current_device() if count and device.index is None else device.index or 0
     if index >= count:
-        usable = ", ".join(["cpu", *(f"cuda:{i}" for i in range(count))])
         raise EngineUnavailableError(
-            f"Device {str(device)!r} needs an NVIDIA GPU that is not usable here; available: "
-            f"{usable}. Use --device cpu (with --engine native, which is faster there)."
+            f"The warp engine needs an NVIDIA GPU for device {str(device)!r}, expected one of "
+            f"{['cpu', *(f'cuda:{i}' for i in range(count))]}. Use --device cpu (with --engine "
+            "native, which is faster there)."
         )
     return wp.get_cuda_device(index)
