@@ -40,3 +40,11 @@ def test_results_go_into_tensors_of_others():
     target = torch.zeros(3, 2)
     torch.mul(field, 2.0, out=target)
     assert torch.equal(target, torch.full((3, 2), 2.0))
+
+
+def test_results_without_elements_are_plain_tensors():
+    # As the limits of joints in a model without joints: no memory, so all addresses are equal.
+    field = SharedField.make(torch.empty(0, 2), 3, "jnt_range")
+    limits = field.clone()
+    assert type(limits) is torch.Tensor
+    limits[..., 0].masked_fill_(torch.ones(3, 0, dtype=torch.bool), -torch.inf)

@@ -104,12 +104,14 @@ class SharedField(torch.Tensor):
                 raise RuntimeError(tensor.error)
         with torch._C.DisableTorchFunctionSubclass():
             result = func(*args, **(kwargs or {}))
-        # Views still alias the shared value, so they stay protected.
+        # Views still alias the shared value, so they stay protected. Without elements all tensors
+        # have the same address.
         if isinstance(target, SharedField):
             if isinstance(result, np.ndarray):
                 result.flags.writeable = False
             elif (
                 isinstance(result, torch.Tensor)
+                and result.numel()
                 and result.untyped_storage().data_ptr() == target.untyped_storage().data_ptr()
             ):
                 result = result.as_subclass(cls)
