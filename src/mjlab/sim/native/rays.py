@@ -533,6 +533,8 @@ def slot_model(model: mujoco.MjModel, slot_types: list[int]) -> mujoco.MjModel:
     if _MESH in slot_types:
         _copy_meshes(model, compiled)
     compiled.geom_sameframe[:] = 0
+    # MuJoCo 4 lets rays pass geoms whose bounding sphere they miss; 0 is for no bound.
+    compiled.geom_rbound[:] = 0.0
     return compiled
 
 
