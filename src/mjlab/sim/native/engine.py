@@ -119,7 +119,6 @@ class NativeEngine(Engine):
                 f"The native engine refuses this model: {error}. Use --engine warp."
             ) from error
         self._rows = torch.from_numpy(self._batch.state)
-        self._warm_start = _state_slice(self._model, mujoco.mjtState.mjSTATE_WARMSTART)
         self._inputs: dict[str, _Input] = {}
         self._outputs: dict[str, _Copy] = {}
         self._tensors: dict[str, torch.Tensor] = {}
@@ -136,8 +135,6 @@ class NativeEngine(Engine):
         self._before: torch.Tensor | None = None
         self._first_steps = _FIRST_STEPS
         self._has_warned = False
-        self._rays: NativeRays | None = None
-        self._renderer: NativeRenderer | None = None
         threads = self._batch.nthread
         self.capabilities = Capabilities(
             name="native",
@@ -177,15 +174,13 @@ class NativeEngine(Engine):
         Nothing but the field changes.
         """
         self._copy_in()
-        if self._before is not None:
-            after = self._rows.clone()
+        kept = self._rows.clone()
+        if self._before is None:
+            self._call(self._batch.forward)
+        else:
             self._rows.copy_(self._before)
             self._call(self._batch.step)
-            self._rows.copy_(after)
-        else:
-            warm_start = self._rows[:, self._warm_start].clone()
-            self._call(self._batch.forward)
-            self._rows[:, self._warm_start] = warm_start
+        self._rows.copy_(kept)
         field.copy_out()
 
     def model_field(self, name: str) -> torch.Tensor:
@@ -378,42 +373,27 @@ class NativeEngine(Engine):
         max_distances: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         self._copy_in()
-        if self._rays is None:
-            self._rays = NativeRays(
-                self._model,
-                self._batch,
-                lambda: (
-                    self.data_field("geom_xpos").numpy(),
-                    self.data_field("geom_xmat").numpy(),
-                ),
-            )
-        hits = self._rays.cast(
-            origins,
-            directions,
-            geom_groups,
-            exclude_body_ids,
-            max_distances,
-            self._model_tensors,
-        )
-        return (
-            torch.from_numpy(hits.distances),
-            torch.from_numpy(hits.normals),
-            torch.from_numpy(hits.geoms),
-        )
+        return self._rays.cast(origins, directions, geom_groups, exclude_body_ids, max_distances)
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:
         if self.capabilities.render_problem is not None:
             raise EngineUnavailableError(self.capabilities.render_problem)
-        if self._renderer is None:
-            self._renderer = NativeRenderer(
-                self._model,
-                self.num_envs,
-                self._batch.nthread,
-                self._make_batch,
-                self.data_field,
-                self._model_tensors,
-            )
         return self._renderer.render(views)
+
+    @functools.cached_property
+    def _rays(self) -> NativeRays:
+        return NativeRays(self._model, self._batch, self.data_field, self._model_tensors)
+
+    @functools.cached_property
+    def _renderer(self) -> NativeRenderer:
+        return NativeRenderer(
+            self._model,
+            self.num_envs,
+            self._batch.nthread,
+            self._make_batch,
+            self.data_field,
+            self._model_tensors,
+        )
 
     def _make_batch(
         self, model: mujoco.MjModel, count: int, num_threads: int | None = None
@@ -594,10 +574,3 @@ def _reason(request: Any, name: str) -> str:
     except ValueError as error:
         return str(error)
     raise AssertionError(name)
-
-
-def _state_slice(model: mujoco.MjModel, component: mujoco.mjtState) -> slice:
-    """Return where a component stands in an integration state, whose order is that of the bits."""
-    before = int(mujoco.mjtState.mjSTATE_INTEGRATION) & (int(component) - 1)
-    start = mujoco.mj_stateSize(model, before)
-    return slice(start, start + mujoco.mj_stateSize(model, int(component)))

@@ -61,18 +61,18 @@ class Textures:
         met: Surfaces,
         geoms: Geoms,
         material: torch.Tensor,
-        model: ReadField,
+        read: ReadField,
     ) -> None:
         """Multiply the colors `rgb` (3, n, P) by the textures of materials.
 
         `material` is (1 or n, G + 1): the material of each geom, -1 for none.
         """
-        texture = of_materials(model("mat_texid")[..., _RGB].long(), material, -1)
+        texture = of_materials(read("mat_texid")[..., _RGB].long(), material, -1)
         painted = (texture >= 0).any(dim=0)
         if not painted.any():
             return
-        repeat = of_materials(model("mat_texrepeat"), material, 1.0).permute(2, 0, 1)
-        uniform = of_materials(model("mat_texuniform") != 0, material, False)
+        repeat = of_materials(read("mat_texrepeat"), material, 1.0).permute(2, 0, 1)
+        uniform = of_materials(read("mat_texuniform") != 0, material, False)
         is_plane = self._kinds == PLANE
         planes = (painted & is_plane).nonzero().flatten().tolist()
         if len(planes) <= _MAX_PLANES:
@@ -260,6 +260,8 @@ _MAPPINGS = {
     HFIELD: _hfield,
     MESH: _mesh,
 }
+KINDS = frozenset(_MAPPINGS)
+"""Types of geoms that cameras see."""
 
 
 def _sky_coordinates(direction: torch.Tensor, width: int) -> torch.Tensor:
