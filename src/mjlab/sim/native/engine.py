@@ -79,9 +79,7 @@ _BOUNDED = (
 _BOUNDING_VOLUMES = ("bvh_aabb", "body_margin")
 
 _STAGES = {
-    "pos": int(mujoco.mjtStage.mjSTAGE_POS),
-    "vel": int(mujoco.mjtStage.mjSTAGE_VEL),
-    "acc": int(mujoco.mjtStage.mjSTAGE_ACC),
+    name: int(getattr(mujoco.mjtStage, f"mjSTAGE_{name.upper()}")) for name in ("pos", "vel", "acc")
 }
 
 # Outputs that a stage does not compute.

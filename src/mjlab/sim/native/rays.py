@@ -65,7 +65,7 @@ class NativeRays:
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         self._pos, self._mat = data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
-        self._rule = CullingRule(model)
+        self._rule = CullingRule(model, np.arange(model.ngeom))
         roots = model.body_rootid[model.geom_bodyid]
         # MuJoCo counts what a mocap body carries as static.
         self._is_carried = model.body_mocapid[roots] >= 0
@@ -277,13 +277,13 @@ class CullingRule:
     sides and its base are not there.
     """
 
-    def __init__(self, model: mujoco.MjModel) -> None:
-        self._model = model
-        # One entry more for the geom -1 of a miss.
-        self.is_field = np.append(model.geom_type == _HFIELD, False)
-        self._is_one_sided = self.is_field | np.append(model.geom_type == _MESH, False)
+    def __init__(self, model: mujoco.MjModel, ids: Array) -> None:
+        """Judge hits on the geoms `ids` (G,) of a model, by their number in it; -1 and G miss."""
+        self._model, self._ids = model, ids
+        self.is_field = np.append(model.geom_type[ids] == _HFIELD, False)
+        self._is_one_sided = self.is_field | np.append(model.geom_type[ids] == _MESH, False)
         self.is_needed = bool(self._is_one_sided.any())
-        """True if the model has a mesh or a height field."""
+        """True if there is a mesh or a height field."""
 
     def passed(
         self,
@@ -300,10 +300,10 @@ class CullingRule:
         Args:
             origins: (n, R, 3). directions: (n, R, 3).
             hits: What the rays met.
-            geoms: The geoms that they met, (n, R), -1 for a miss.
+            geoms: Numbers of the geoms that they met, (n, R).
             envs: Environment of each row, (n,).
-            pos: Positions of geoms, (N, ngeom, 3), read of height fields only.
-            mat: Orientations, (N, ngeom, 3, 3).
+            pos: Positions of the geoms, (N, G, 3), read of height fields only.
+            mat: Orientations, (N, G, 3, 3).
         """
         normals = hits.normals
         passed = self._is_one_sided[geoms]
@@ -318,7 +318,7 @@ class CullingRule:
         local = np.einsum("mkj,mk->jm", mat, points)
         # Rays from below the surface end on the base, which looks like flat ground.
         is_low = np.abs(local[2]) < _BASE_TOLERANCE
-        surface, _ = _elevation(self._model, fields[is_low], local[:2, is_low])
+        surface, _ = _elevation(self._model, self._ids[fields[is_low]], local[:2, is_low])
         is_low[is_low] = surface > _SURFACE_TOLERANCE
         passed[at] = (up <= _SIDE) | is_low
         return passed

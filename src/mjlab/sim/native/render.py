@@ -220,9 +220,9 @@ class _View:
         self._shadow_slots = make_slots(rows, self._lens.num_rays) if view.use_shadows else None
         self._shading = _Shading(model, kinds, view.use_textures)
         self._aimed: _Rays | None = None
-        self._rule = CullingRule(model)
+        self._rule = CullingRule(model, self._ids[:-1].numpy())
         self._has_fields = HFIELD in kinds
-        self._has_backs = self._has_fields or MESH in kinds or self._lens.is_orthographic
+        self._has_backs = self._rule.is_needed or self._lens.is_orthographic
 
     def render(self, envs: slice, read: ReadField, lens_varies: bool) -> None:
         """Render the environments `envs`, whose fields `read` returns.
@@ -246,8 +246,6 @@ class _View:
         missed = ~((depth >= 0.0) & (depth <= self._far))
         if images.depth is not None:
             lens.copy_to_image(depth.masked_fill(missed, 0.0)[..., None], images.depth[envs])
-        if view.data_types == ("depth",):
-            return
         columns = slots.columns(slice(rows), slots.hits.geoms[:rows]).view(n, -1)
         columns.masked_fill_(missed, len(self._ids) - 1)
         if images.segmentation is not None:
@@ -272,16 +270,11 @@ class _View:
         out of its sight. It is looked at hit by hit for meshes, height fields and parallel rays.
         Of shadow rays, only those on height fields, of which only the top is in the way.
         """
-        ids, rows_per_env = self._ids.numpy(), slots.num_rows // self.envs_at_a_time
-        # By ids of the model, as the rule wants them, which reads poses of height fields only.
-        n = len(geoms.pos) if self._has_fields else 0
-        pos = np.zeros((n, self._model.ngeom, 3), np.float32)
-        mat = np.zeros((n, self._model.ngeom, 3, 3), np.float32)
-        if n:
-            pos[:, ids[:-1]], mat[:, ids[:-1]] = geoms.pos, geoms.mat
+        rows_per_env = slots.num_rows // self.envs_at_a_time
+        pos, mat = geoms.pos.numpy(), geoms.mat.numpy()
 
         def passed(rows: np.ndarray, origins: np.ndarray, directions: np.ndarray, hits: Hits):
-            met, envs = ids[slots.columns(rows, hits.geoms).numpy()], rows // rows_per_env
+            met, envs = slots.columns(rows, hits.geoms).numpy(), rows // rows_per_env
             backs = self._rule.passed(origins, directions, hits, met, envs, pos, mat)
             if is_shadow:
                 return backs & self._rule.is_field[met]
@@ -340,15 +333,12 @@ class _Lens:
         self.num_rays = self.num_tiles * self.tile_rays
         x = torch.arange(self.columns * tile_width).clamp(max=width - 1)
         y = torch.arange(self.rows * tile_height).clamp(max=height - 1)
-        self._x_edges, self._y_edges = (
-            ((p.view(-1, size)[:, [0, -1]].t() + 0.5) / length).reshape(-1)
-            for p, size, length in ((x, tile_width, width), (y, tile_height, height))
-        )
         # Inward normals of the planes in `_Rays`, x and y: to the right, to the left, down, up.
         self._normals = torch.tensor([[1.0, -1, 0, 0], [0, 0, -1, 1]]).repeat_interleave(
             torch.tensor([self.columns, self.columns, self.rows, self.rows]), dim=1
         )
         shape = (self.rows, tile_height, self.columns, tile_width)
+        self._tiles = (-1, self.rows, self.columns, tile_height, tile_width)
         pixels = (y[:, None] * width + x[None, :]).view(shape).transpose(1, 2).reshape(-1)
         self._u, self._v = (pixels % width + 0.5) / width, (pixels // width + 0.5) / height
         # Where each pixel of the image is among the rays. One that is repeated is in several.
@@ -372,8 +362,10 @@ class _Lens:
         else:
             directions, origins = torch.stack((x, y, -one), dim=-1), None
             directions /= directions.norm(dim=-1, keepdim=True)
-        x, y = left + (right - left) * self._x_edges, top + (bottom - top) * self._y_edges
-        edges = self._normals.sum(dim=0) * torch.cat((x, y), dim=1)
+        # The outermost rays of each column and row of tiles.
+        x, y = (values.view(self._tiles)[..., [0, -1], [0, -1]] for values in (x, y))
+        edges = torch.cat((x[:, 0].mT.flatten(1), y[:, :, 0].mT.flatten(1)), dim=1)
+        edges *= self._normals.sum(dim=0)
         normals, none = self._normals.expand(len(edges), -1, -1), torch.zeros_like(edges[:, None])
         if self.is_orthographic:
             return _Rays(directions, origins, torch.cat((normals, none), dim=1), -edges[:, None])
@@ -641,24 +633,6 @@ _SPOT = int(mujoco.mjtLightType.mjLIGHT_SPOT)
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 
 
-@dataclass
-class _Light:
-    """A light at n x P points, in the frame of the camera; n and P may be 1."""
-
-    diffuse: torch.Tensor
-    """Color, (3, n, 1)."""
-    specular: torch.Tensor
-    """Color, (3, n, 1)."""
-    direction: torch.Tensor
-    """Unit vector to the light, (3, n, P)."""
-    distance: torch.Tensor
-    """Distance to the light (m), (n, P)."""
-    strength: torch.Tensor
-    """Part that arrives, (n, P)."""
-    casts_shadow: torch.Tensor
-    """True where it does, (n, 1)."""
-
-
 class _Shading:
     """Colors of surfaces, by the formulas of MuJoCo Warp's renderer.
 
@@ -709,22 +683,22 @@ class _Shading:
         if shines:
             exponent, gloss = of_pixels(exponent, met.columns), torch.zeros_like(rgb)
             facing = -_dot(met.normals, met.directions)
-        for light in self._lights(met.points, pos, mat, read):
-            cosine = _dot(met.normals, light.direction).clamp_(min=0.0)
-            strength = light.strength
-            if shadow is not None and light.casts_shadow.any():
+        for diffuse, specular, direction, distance, strength, casts_shadow in self._lights(
+            met.points, pos, mat, read
+        ):
+            cosine = _dot(met.normals, direction).clamp_(min=0.0)
+            if shadow is not None and casts_shadow.any():
                 origins = met.points + _ABOVE * met.normals
-                direction = light.direction.expand_as(origins)
-                hidden = shadow(origins, direction, light.distance - _BEFORE)
-                hidden &= light.casts_shadow & (cosine > 0.0)
+                hidden = shadow(origins, direction.expand_as(origins), distance - _BEFORE)
+                hidden &= casts_shadow & (cosine > 0.0)
                 strength = strength * torch.where(hidden, _IN_SHADOW, 1.0)
-            brightness.addcmul_(cosine * strength, light.diffuse)
-            if shines and light.specular.any():
+            brightness.addcmul_(cosine * strength, diffuse)
+            if shines and specular.any():
                 # |L + V|^2 = 2 + 2 L.V, so that the direction halfway is never needed itself.
-                length = (2.0 - 2.0 * _dot(met.directions, light.direction)).clamp_(min=1e-12)
+                length = (2.0 - 2.0 * _dot(met.directions, direction)).clamp_(min=1e-12)
                 halfway = (cosine + facing).div_(length.sqrt_()).clamp_(0.0, 1.0)
                 halfway = halfway.pow_(exponent).masked_fill_(cosine <= 0.0, 0.0)
-                gloss.addcmul_(halfway.mul_(strength), light.specular)
+                gloss.addcmul_(halfway.mul_(strength), specular)
         rgb *= brightness
         if shines:
             rgb += gloss.mul_(of_pixels(reflected, met.columns))
@@ -755,8 +729,15 @@ class _Shading:
         pos: torch.Tensor,
         mat: torch.Tensor,
         read: ReadField,
-    ) -> Iterator[_Light]:
-        """Yield what each light that shines somewhere is at the points (3, n, P)."""
+    ) -> Iterator[tuple[torch.Tensor, ...]]:
+        """Yield what each light that shines somewhere is at the points (3, n, P).
+
+        Axes n and P may be 1. Yields:
+            Diffuse and specular color, (3, n, 1).
+            Unit vector to the light, (3, n, P), and distance (m), (n, P).
+            Part that arrives, (n, P).
+            Whether it casts shadows, (n, 1) bool.
+        """
         endless, one = torch.full((1, 1), _ENDLESS), torch.ones(1, 1)
         for i in range(self._num_lights):
 
@@ -789,8 +770,7 @@ class _Shading:
                 direction = torch.where(is_far, direction, to_light)
                 distance = torch.where(is_far, endless, distance)
                 strength = torch.where(is_far, one, strength)
-            casts_shadow = own("castshadow") != 0
-            yield _Light(diffuse, specular, direction, distance, strength, casts_shadow)
+            yield diffuse, specular, direction, distance, strength, own("castshadow") != 0
         if self._headlight.active:
             diffuse, specular = (
                 torch.tensor(color, dtype=torch.float32).view(3, 1, 1)
@@ -798,7 +778,7 @@ class _Shading:
             )
             # It shines along the optical axis.
             direction = torch.tensor([0.0, 0.0, 1.0]).view(3, 1, 1)
-            yield _Light(diffuse, specular, direction, endless, one, torch.tensor(False))
+            yield diffuse, specular, direction, endless, one, torch.tensor(False)
 
 
 def _dot(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
