@@ -380,30 +380,27 @@ class GroundTable:
         self._origin = origin - self._edge
         self._shape = np.ceil(extent / self._edge).astype(int) + 2
 
-        def areas(first: Array, end: Array) -> list[tuple[slice, slice]]:
-            first, end = (np.clip(c, 0, self._shape).astype(int) for c in (first, end))
-            return [np.s_[a:c, b:d] for (a, b), (c, d) in zip(first, end, strict=True)]
-
         low, high = (low - self._origin) / self._edge, (high - self._origin) / self._edge
-        touched = areas(np.floor(low - 1e-6), np.floor(high + 1e-6) + 1)
-        covered = areas(np.ceil(low), np.floor(high))
+        # Areas of cells that geoms touch, [start, end) along x and y.
+        start = np.clip(np.floor(low - 1e-6), 0, self._shape).astype(int)
+        end = np.clip(np.floor(high + 1e-6) + 1, 0, self._shape).astype(int)
+        cells = np.arange(self._shape.prod())
+        grid = cells.reshape(self._shape)
+        touched = [grid[a:c, b:d].ravel() for (a, b), (c, d) in zip(start, end, strict=True)]
+        cell = np.concatenate(touched)
+        entries = np.repeat(np.arange(len(geoms)), [len(area) for area in touched])
+        entries = entries[np.argsort(cell, kind="stable")]
+        count = np.bincount(cell, minlength=len(cells))
+        ends = count.cumsum()
         # Lists end with an entry for no geom, whose values are NaN, so that nothing is met there.
-        count = np.ones(self._shape, dtype=np.int64)
-        for area in touched:
-            count[area] += 1
-        first = count.cumsum().reshape(self._shape) - count
-        place = first.copy()
-        self._entries = np.full(count.sum(), len(geoms), dtype=np.int32)
-        covering = np.full(self._shape, len(geoms), dtype=np.int32)
-        for i, (area, inner) in enumerate(zip(touched, covered, strict=True)):
-            # Boxes are listed by their surface, a field by its summit.
-            is_highest = place[inner] == first[inner]
-            if is_field[i]:
-                is_highest &= count[inner] == 2
-            covering[inner][is_highest] = i
-            self._entries[place[area]] = i
-            place[area] += 1
-        self._first, self._covering = first.ravel(), covering.ravel()
+        self._entries = np.insert(entries, ends, len(geoms)).astype(np.int32)
+        self._first = ends - count + cells
+        # Boxes are listed by their surface, a field by its summit.
+        highest, place = self._entries[self._first], np.stack(np.unravel_index(cells, self._shape))
+        covers = np.append(~is_field, False)[highest] | (count == 1)
+        covers &= (place >= low.T.take(highest, axis=1, mode="clip")).all(axis=0)
+        covers &= (place + 1 <= high.T.take(highest, axis=1, mode="clip")).all(axis=0)
+        self._covering = np.where(covers, highest, len(geoms))
         self._geoms = np.append(geoms, -1).astype(np.int32)
         self._is_field = np.append(is_field, False)
         self._pos = np.column_stack((pos.T, [np.nan] * 3))
