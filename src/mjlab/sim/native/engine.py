@@ -246,13 +246,10 @@ class NativeEngine(Engine):
         recorded = {name: field.new_empty(nstep, *field.shape) for name, field in fields.items()}
         if nstep == 0:
             return recorded
+        calls = [nstep - 1, 1] if self._first_steps and nstep > 1 else [nstep]
         if record:
             # Not `Batch.rollout`: it stops environments that warn, and single steps are as fast.
             calls = [1] * nstep
-        elif self._first_steps and nstep > 1:
-            calls = [nstep - 1, 1]
-        else:
-            calls = [nstep]
         self._first_steps = max(self._first_steps - 1, 0)
         self._copy_in()
         for k, count in enumerate(calls):
@@ -281,8 +278,13 @@ class NativeEngine(Engine):
             self._inputs["qacc_warmstart"].copy_out(env_ids)
         # An `MjData` serves many environments: what a stage does not compute is another's.
         for name in self._outputs.keys() - _LATER_FIELDS[stage]:
-            columns = self._sensor_columns[stage] if name == "sensordata" else None
-            self._outputs[name].copy_out(rows, columns)
+            field, columns = self._outputs[name], self._sensor_columns[stage]
+            if name == "sensordata" and columns is not None:
+                kept = field.values.clone()
+                field.copy_out(rows)
+                torch.where(columns, field.values, kept, out=field.values)
+            else:
+                field.copy_out(rows)
 
     def reset(self, env_ids: torch.Tensor | None) -> None:
         self._copy_in_model()
@@ -410,8 +412,9 @@ class NativeEngine(Engine):
         axes, com = self.data_field("cdof"), self.data_field("subtree_com")
         body_ids = body_ids.long()
         moves = self._moving_dofs[body_ids][..., None]
-        rows = torch.arange(self.num_envs)
-        arm = points - com[rows, self._tree_roots[body_ids]]
+        # `cdof` is about the center of mass of the body's tree.
+        roots = torch.from_numpy(self._model.body_rootid)[body_ids].long()
+        arm = points - com[torch.arange(self.num_envs), roots]
         rotational = axes[..., :3] * moves
         translational = axes[..., 3:] * moves
         translational += torch.linalg.cross(rotational, arm[:, None].expand_as(rotational))
@@ -426,11 +429,6 @@ class NativeEngine(Engine):
             first = self._model.body_dofadr[body]
             moves[body, first : first + self._model.body_dofnum[body]] = 1.0
         return torch.from_numpy(moves)
-
-    @functools.cached_property
-    def _tree_roots(self) -> torch.Tensor:
-        """(nbody,) the body at the top of each body's tree, whose centre of mass `cdof` is about."""
-        return torch.from_numpy(self._model.body_rootid.astype(np.int64))
 
     # Copies.
 
@@ -501,16 +499,12 @@ class _Copy:
             self.source = source
             self.values = source.to(dtype, copy=True, memory_format=torch.contiguous_format)
 
-    def copy_out(
-        self, rows: torch.Tensor | None = None, columns: torch.Tensor | None = None
-    ) -> None:
-        """Copy the source out: all of it, or `rows`, or `columns` ((size,) bool) of a matrix."""
-        if rows is None and columns is None:
+    def copy_out(self, rows: torch.Tensor | None = None) -> None:
+        """Copy the source out: all of it, or `rows`."""
+        if rows is None:
             self.values.copy_(self.source)
-            return
-        index = slice(None) if rows is None else rows
-        new = self.source[index].to(self.values.dtype)
-        self.values[index] = new if columns is None else new.where(columns, self.values[index])
+        else:
+            self.values[rows] = self.source[rows].to(self.values.dtype)
 
 
 class _Input(_Copy):
@@ -539,10 +533,8 @@ class _Input(_Copy):
         self._seen.copy_(self.values)
         return written
 
-    def copy_out(
-        self, rows: torch.Tensor | None = None, columns: torch.Tensor | None = None
-    ) -> None:
-        super().copy_out(rows, columns)
+    def copy_out(self, rows: torch.Tensor | None = None) -> None:
+        super().copy_out(rows)
         index = slice(None) if rows is None else rows
         self._seen[index] = self.values[index]
         self._version = self.values._version

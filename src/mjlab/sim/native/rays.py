@@ -119,7 +119,11 @@ class NativeRays:
         carried = welded & self._is_carried
         others = bool((in_groups & ~welded).any() or model.nflex)
         static = np.flatnonzero(welded & ~carried)
-        ground = static[_alpha(model, static) != 0.0]
+        # The opacity that counts is that of the material if a geom has one.
+        material = model.geom_matid[static]
+        alpha = np.append(model.mat_rgba[:, 3], 1.0)[material]
+        alpha = np.where(material < 0, model.geom_rgba[static, 3], alpha)
+        ground = static[alpha != 0.0]
         is_upright = (self._mat[ground] == np.eye(3)).all()
         kinds, bodies = model.geom_type[ground], model.geom_bodyid[ground]
         if (
@@ -163,14 +167,6 @@ class NativeRays:
 
 def _group_mask(groups: tuple[int, ...] | None) -> Array:
     return np.isin(np.arange(6), range(6) if groups is None else groups).astype(np.uint8)
-
-
-def _alpha(model: mujoco.MjModel, geoms: Array) -> Array:
-    """Return the opacity that counts, that of the material if a geom has one."""
-    material = model.geom_matid[geoms]
-    alpha = model.geom_rgba[geoms, 3].copy()
-    alpha[material >= 0] = model.mat_rgba[material[material >= 0], 3]
-    return alpha
 
 
 @dataclass

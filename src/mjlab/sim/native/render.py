@@ -678,7 +678,11 @@ class _Shading:
         brightness = torch.zeros_like(rgb)
         if emission.any():
             brightness += of_pixels(emission, met.columns)
-        brightness += self._ambient(read)
+        ambient = torch.full((3,), 0.0 if self._num_lights else _WITHOUT_LIGHTS)
+        if self._headlight.active:
+            ambient = torch.tensor(self._headlight.ambient, dtype=torch.float32)
+        own = read("light_ambient") * (read("light_active") != 0)[..., None]
+        brightness += (ambient + own.sum(dim=1)).t()[..., None]
         shines = bool(reflected.any())
         if shines:
             exponent, gloss = of_pixels(exponent, met.columns), torch.zeros_like(rgb)
@@ -710,18 +714,6 @@ class _Shading:
             world = (mat[env] @ directions.t()[..., None]).squeeze(-1).t()
             self._textures.paint_sky(rgb, missed, world)
         return torch.stack(rgb.mul_(255.0).to(torch.uint8).unbind(), dim=-1)
-
-    def _ambient(self, read: ReadField) -> torch.Tensor:
-        """Return ambient light, (3, n, 1)."""
-        ambient = torch.zeros(1, 3)
-        if self._headlight.active:
-            ambient = torch.tensor(self._headlight.ambient, dtype=torch.float32)[None]
-        elif not self._num_lights:
-            ambient = torch.full((1, 3), _WITHOUT_LIGHTS)
-        if self._num_lights:
-            own = read("light_ambient") * (read("light_active") != 0)[..., None]
-            ambient = ambient + own.sum(dim=1)
-        return ambient.t()[..., None]
 
     def _lights(
         self,
