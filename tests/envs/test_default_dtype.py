@@ -62,6 +62,9 @@ def rollout(task: str, engine: Any, dtype: torch.dtype) -> list[torch.Tensor]:
     [
         ("Mjlab-Velocity-Rough-Unitree-Go1", "native"),
         ("Mjlab-Lift-Cube-Yam", "native"),
+        ("Mjlab-Lift-Cube-Yam-Depth", "native"),
+        ("Mjlab-Lift-Cube-Yam-Rgb", "native"),
+        ("Mjlab-Multi-Cube-Seg-Yam", "native"),
         ("Mjlab-Cartpole-Swingup", "native"),
         ("Mjlab-Cartpole-Swingup", "warp"),
     ],

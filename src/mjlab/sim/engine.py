@@ -140,7 +140,7 @@ class Images:
         if "rgb" in view.data_types:
             images.rgb = torch.zeros(*shape, 3, dtype=torch.uint8, device=device)
         if "depth" in view.data_types:
-            images.depth = torch.zeros(*shape, 1, device=device)
+            images.depth = torch.zeros(*shape, 1, dtype=torch.float32, device=device)
         if "segmentation" in view.data_types:
             images.segmentation = torch.full(
                 (*shape, 2), BACKGROUND, dtype=torch.int32, device=device

@@ -79,9 +79,7 @@ _BOUNDED = (
 _BOUNDING_VOLUMES = ("bvh_aabb", "body_margin")
 
 _STAGES = {
-    "pos": int(mujoco.mjtStage.mjSTAGE_POS),
-    "vel": int(mujoco.mjtStage.mjSTAGE_VEL),
-    "acc": int(mujoco.mjtStage.mjSTAGE_ACC),
+    name: int(getattr(mujoco.mjtStage, f"mjSTAGE_{name.upper()}")) for name in ("pos", "vel", "acc")
 }
 
 # Outputs that a stage does not compute.
@@ -119,7 +117,6 @@ class NativeEngine(Engine):
                 f"The native engine refuses this model: {error}. Use --engine warp."
             ) from error
         self._rows = torch.from_numpy(self._batch.state)
-        self._warm_start = _state_slice(self._model, mujoco.mjtState.mjSTATE_WARMSTART)
         self._inputs: dict[str, _Input] = {}
         self._outputs: dict[str, _Copy] = {}
         self._tensors: dict[str, torch.Tensor] = {}
@@ -136,8 +133,6 @@ class NativeEngine(Engine):
         self._before: torch.Tensor | None = None
         self._first_steps = _FIRST_STEPS
         self._has_warned = False
-        self._rays: NativeRays | None = None
-        self._renderer: NativeRenderer | None = None
         threads = self._batch.nthread
         self.capabilities = Capabilities(
             name="native",
@@ -177,15 +172,13 @@ class NativeEngine(Engine):
         Nothing but the field changes.
         """
         self._copy_in()
-        if self._before is not None:
-            after = self._rows.clone()
+        kept = self._rows.clone()
+        if self._before is None:
+            self._call(self._batch.forward)
+        else:
             self._rows.copy_(self._before)
             self._call(self._batch.step)
-            self._rows.copy_(after)
-        else:
-            warm_start = self._rows[:, self._warm_start].clone()
-            self._call(self._batch.forward)
-            self._rows[:, self._warm_start] = warm_start
+        self._rows.copy_(kept)
         field.copy_out()
 
     def model_field(self, name: str) -> torch.Tensor:
@@ -253,13 +246,10 @@ class NativeEngine(Engine):
         recorded = {name: field.new_empty(nstep, *field.shape) for name, field in fields.items()}
         if nstep == 0:
             return recorded
+        calls = [nstep - 1, 1] if self._first_steps and nstep > 1 else [nstep]
         if record:
             # Not `Batch.rollout`: it stops environments that warn, and single steps are as fast.
             calls = [1] * nstep
-        elif self._first_steps and nstep > 1:
-            calls = [nstep - 1, 1]
-        else:
-            calls = [nstep]
         self._first_steps = max(self._first_steps - 1, 0)
         self._copy_in()
         for k, count in enumerate(calls):
@@ -288,8 +278,13 @@ class NativeEngine(Engine):
             self._inputs["qacc_warmstart"].copy_out(env_ids)
         # An `MjData` serves many environments: what a stage does not compute is another's.
         for name in self._outputs.keys() - _LATER_FIELDS[stage]:
-            columns = self._sensor_columns[stage] if name == "sensordata" else None
-            self._outputs[name].copy_out(rows, columns)
+            field, columns = self._outputs[name], self._sensor_columns[stage]
+            if name == "sensordata" and columns is not None:
+                kept = field.values.clone()
+                field.copy_out(rows)
+                torch.where(columns, field.values, kept, out=field.values)
+            else:
+                field.copy_out(rows)
 
     def reset(self, env_ids: torch.Tensor | None) -> None:
         self._copy_in_model()
@@ -378,42 +373,27 @@ class NativeEngine(Engine):
         max_distances: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         self._copy_in()
-        if self._rays is None:
-            self._rays = NativeRays(
-                self._model,
-                self._batch,
-                lambda: (
-                    self.data_field("geom_xpos").numpy(),
-                    self.data_field("geom_xmat").numpy(),
-                ),
-            )
-        hits = self._rays.cast(
-            origins,
-            directions,
-            geom_groups,
-            exclude_body_ids,
-            max_distances,
-            self._model_tensors,
-        )
-        return (
-            torch.from_numpy(hits.distances),
-            torch.from_numpy(hits.normals),
-            torch.from_numpy(hits.geoms),
-        )
+        return self._rays.cast(origins, directions, geom_groups, exclude_body_ids, max_distances)
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:
         if self.capabilities.render_problem is not None:
             raise EngineUnavailableError(self.capabilities.render_problem)
-        if self._renderer is None:
-            self._renderer = NativeRenderer(
-                self._model,
-                self.num_envs,
-                self._batch.nthread,
-                self._make_batch,
-                self.data_field,
-                self._model_tensors,
-            )
         return self._renderer.render(views)
+
+    @functools.cached_property
+    def _rays(self) -> NativeRays:
+        return NativeRays(self._model, self._batch, self.data_field, self._model_tensors)
+
+    @functools.cached_property
+    def _renderer(self) -> NativeRenderer:
+        return NativeRenderer(
+            self._model,
+            self.num_envs,
+            self._batch.nthread,
+            self._make_batch,
+            self.data_field,
+            self._model_tensors,
+        )
 
     def _make_batch(
         self, model: mujoco.MjModel, count: int, num_threads: int | None = None
@@ -432,8 +412,9 @@ class NativeEngine(Engine):
         axes, com = self.data_field("cdof"), self.data_field("subtree_com")
         body_ids = body_ids.long()
         moves = self._moving_dofs[body_ids][..., None]
-        rows = torch.arange(self.num_envs)
-        arm = points - com[rows, self._tree_roots[body_ids]]
+        # `cdof` is about the center of mass of the body's tree.
+        roots = torch.from_numpy(self._model.body_rootid)[body_ids].long()
+        arm = points - com[torch.arange(self.num_envs), roots]
         rotational = axes[..., :3] * moves
         translational = axes[..., 3:] * moves
         translational += torch.linalg.cross(rotational, arm[:, None].expand_as(rotational))
@@ -448,11 +429,6 @@ class NativeEngine(Engine):
             first = self._model.body_dofadr[body]
             moves[body, first : first + self._model.body_dofnum[body]] = 1.0
         return torch.from_numpy(moves)
-
-    @functools.cached_property
-    def _tree_roots(self) -> torch.Tensor:
-        """(nbody,) the body at the top of each body's tree, whose centre of mass `cdof` is about."""
-        return torch.from_numpy(self._model.body_rootid.astype(np.int64))
 
     # Copies.
 
@@ -523,16 +499,12 @@ class _Copy:
             self.source = source
             self.values = source.to(dtype, copy=True, memory_format=torch.contiguous_format)
 
-    def copy_out(
-        self, rows: torch.Tensor | None = None, columns: torch.Tensor | None = None
-    ) -> None:
-        """Copy the source out: all of it, or `rows`, or `columns` ((size,) bool) of a matrix."""
-        if rows is None and columns is None:
+    def copy_out(self, rows: torch.Tensor | None = None) -> None:
+        """Copy the source out: all of it, or `rows`."""
+        if rows is None:
             self.values.copy_(self.source)
-            return
-        index = slice(None) if rows is None else rows
-        new = self.source[index].to(self.values.dtype)
-        self.values[index] = new if columns is None else new.where(columns, self.values[index])
+        else:
+            self.values[rows] = self.source[rows].to(self.values.dtype)
 
 
 class _Input(_Copy):
@@ -561,10 +533,8 @@ class _Input(_Copy):
         self._seen.copy_(self.values)
         return written
 
-    def copy_out(
-        self, rows: torch.Tensor | None = None, columns: torch.Tensor | None = None
-    ) -> None:
-        super().copy_out(rows, columns)
+    def copy_out(self, rows: torch.Tensor | None = None) -> None:
+        super().copy_out(rows)
         index = slice(None) if rows is None else rows
         self._seen[index] = self.values[index]
         self._version = self.values._version
@@ -594,10 +564,3 @@ def _reason(request: Any, name: str) -> str:
     except ValueError as error:
         return str(error)
     raise AssertionError(name)
-
-
-def _state_slice(model: mujoco.MjModel, component: mujoco.mjtState) -> slice:
-    """Return where a component stands in an integration state, whose order is that of the bits."""
-    before = int(mujoco.mjtState.mjSTATE_INTEGRATION) & (int(component) - 1)
-    start = mujoco.mj_stateSize(model, before)
-    return slice(start, start + mujoco.mj_stateSize(model, int(component)))

@@ -20,7 +20,7 @@ from mujoco.batch import SimulationError
 logger = logging.getLogger(__name__)
 
 Array = np.ndarray
-Passed = Callable[[Any, Array, Array, "Hits"], Array]
+Passed = Callable[[Array, Array, Array, "Hits"], Array]
 """Predicate of hits to ignore: rows, their origins, directions and hits to (n, R) bool."""
 
 _T = mujoco.mjtGeom
@@ -49,18 +49,27 @@ class NativeRays:
     """Casts the rays of a native engine."""
 
     def __init__(
-        self, model: mujoco.MjModel, batch: Any, poses: Callable[[], tuple[Array, Array]]
+        self,
+        model: mujoco.MjModel,
+        batch: Any,
+        data_field: Callable[[str], torch.Tensor],
+        expanded: Mapping[str, torch.Tensor],
     ) -> None:
         """Cast in `batch`, simulations of `model`.
 
-        `poses()` returns the current positions (N, ngeom, 3) and orientations (N, ngeom, 3, 3) of
-        the geoms.
+        `data_field` returns a field of `MjData` by name, (N, ...); `expanded` holds the fields of
+        `MjModel` that differ between environments, (N, ...).
         """
-        self._model, self._batch, self._poses = model, batch, poses
+        self._model, self._batch = model, batch
+        self._data_field, self._expanded = data_field, expanded
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
-        self._pos, self._mat = data.geom_xpos.copy(), data.geom_xmat.copy()
-        self._rule = CullingRule(model, self._pos, self._mat)
+        self._pos, self._mat = data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
+        self._rule = CullingRule(model, np.arange(model.ngeom))
+        roots = model.body_rootid[model.geom_bodyid]
+        # MuJoCo counts what a mocap body carries as static.
+        self._is_carried = model.body_mocapid[roots] >= 0
+        self._fields_are_carried = self._is_carried[model.geom_type == _HFIELD].any()
         self._tables: dict[Any, tuple[GroundTable | None, bool]] = {}
 
     def cast(
@@ -70,12 +79,8 @@ class NativeRays:
         geom_groups: tuple[int, ...] | None,
         exclude_body_ids: torch.Tensor | None,
         max_distances: torch.Tensor | None,
-        fields: Mapping[str, torch.Tensor],
-    ) -> Hits:
-        """Cast rays (N, R); see `Engine.raycast`.
-
-        `fields` are the per-environment model fields, (N, ...).
-        """
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Cast rays (N, R); see `Engine.raycast`."""
         excluded = np.array([-1]) if exclude_body_ids is None else exclude_body_ids.numpy()
         starts, along = np.ascontiguousarray(origins.numpy()), directions.numpy()
         hits = Hits.empty(*starts.shape[:2])
@@ -86,7 +91,7 @@ class NativeRays:
             if key not in self._tables:
                 self._tables[key] = self._ground(geom_groups, excluded)
             table, has_others = self._tables[key]
-        if table is None or not table.is_current(fields):
+        if table is None or not table.is_current(self._expanded):
             self._cast_in_batch(starts, along, geom_groups, excluded, hits)
         else:
             table.cast(starts, hits)
@@ -96,7 +101,10 @@ class NativeRays:
                 hits.take_nearer(others)
         if max_distances is not None:
             hits.forget(hits.distances > max_distances.numpy())
-        return hits
+        distances, normals, geoms = map(
+            torch.from_numpy, (hits.distances, hits.normals, hits.geoms)
+        )
+        return distances, normals, geoms
 
     def _ground(
         self, groups: tuple[int, ...] | None, excluded: Array
@@ -108,12 +116,15 @@ class NativeRays:
         model = self._model
         in_groups = _group_mask(groups)[model.geom_group.clip(0, 5)].astype(bool)
         welded = in_groups & (model.body_weldid[model.geom_bodyid] == 0)
-        # MuJoCo counts what a mocap body carries as static.
-        carried = welded & (model.body_mocapid[model.body_rootid[model.geom_bodyid]] >= 0)
+        carried = welded & self._is_carried
         others = bool((in_groups & ~welded).any() or model.nflex)
         static = np.flatnonzero(welded & ~carried)
-        ground = static[_alpha(model, static) != 0.0]
-        is_upright = (self._mat[ground] == np.eye(3).ravel()).all()
+        # The opacity that counts is that of the material if a geom has one.
+        material = model.geom_matid[static]
+        alpha = np.append(model.mat_rgba[:, 3], 1.0)[material]
+        alpha = np.where(material < 0, model.geom_rgba[static, 3], alpha)
+        ground = static[alpha != 0.0]
+        is_upright = (self._mat[ground] == np.eye(3)).all()
         kinds, bodies = model.geom_type[ground], model.geom_bodyid[ground]
         if (
             carried.any()
@@ -134,12 +145,13 @@ class NativeRays:
         static: bool = True,
     ) -> None:
         """Cast against the geoms of the model, those that never move only if `static`."""
-        poses = self._poses() if self._rule.fields_are_carried else None
+        n = len(origins)
+        pos, mat = (np.broadcast_to(x, (n, *x.shape)) for x in (self._pos, self._mat))
+        if self._fields_are_carried:
+            pos, mat = (self._data_field(name).numpy() for name in ("geom_xpos", "geom_xmat"))
 
-        def passed(rows: Any, origins: Array, directions: Array, hits: Hits) -> Array:
-            found = hits.distances, hits.normals, hits.geoms
-            of_rows = None if poses is None else (poses[0][rows], poses[1][rows])
-            return self._rule.passed(origins, directions, *found, of_rows)
+        def passed(rows: Array, origins: Array, directions: Array, hits: Hits) -> Array:
+            return self._rule.passed(origins, directions, hits, hits.geoms, rows, pos, mat)
 
         cast_through(
             self._batch,
@@ -157,14 +169,6 @@ def _group_mask(groups: tuple[int, ...] | None) -> Array:
     return np.isin(np.arange(6), range(6) if groups is None else groups).astype(np.uint8)
 
 
-def _alpha(model: mujoco.MjModel, geoms: Array) -> Array:
-    """Return the opacity that counts, that of the material if a geom has one."""
-    material = model.geom_matid[geoms]
-    alpha = model.geom_rgba[geoms, 3].copy()
-    alpha[material >= 0] = model.mat_rgba[material[material >= 0], 3]
-    return alpha
-
-
 @dataclass
 class Hits:
     """Results of rays: distances (n, R), normals (n, R, 3), geoms (n, R); -1, 0 and -1 on a miss."""
@@ -175,12 +179,12 @@ class Hits:
 
     @classmethod
     def empty(cls, rows: int, rays: int) -> Hits:
-        """Allocate results, of any values."""
+        """Allocate results, to be written."""
         shape = (rows, rays)
         return cls(
-            np.empty(shape, np.float32),
-            np.empty((*shape, 3), np.float32),
-            np.empty(shape, np.int32),
+            np.zeros(shape, np.float32),
+            np.zeros((*shape, 3), np.float32),
+            np.zeros(shape, np.int32),
         )
 
     def __getitem__(self, rows: Any) -> Hits:
@@ -241,7 +245,7 @@ def cast_through(
         hits[some] = Hits(distances, normals, geoms)
         if passed is None:
             return
-        repeat = passed(some, origins[some], directions[some], hits[some])
+        repeat = passed(np.arange(len(origins))[some], origins[some], directions[some], hits[some])
         chosen = repeat.any(axis=1)
         if not chosen.any():
             break
@@ -269,52 +273,48 @@ class CullingRule:
     sides and its base are not there.
     """
 
-    def __init__(self, model: mujoco.MjModel, pos: Array, mat: Array) -> None:
-        """Take the poses of geoms that do not move, (ngeom, 3) and (ngeom, 9).
-
-        They count for height fields, which move only where a mocap body carries them.
-        """
-        self._model = model
-        roots = model.body_rootid[model.geom_bodyid[model.geom_type == _HFIELD]]
-        self.fields_are_carried = bool((model.body_mocapid[roots] >= 0).any())
-        """True if each environment places a height field for itself."""
-        # One entry more for the geom -1 of a miss.
-        self._is_field = np.append(model.geom_type == _HFIELD, False)
-        self._is_one_sided = self._is_field | np.append(model.geom_type == _MESH, False)
+    def __init__(self, model: mujoco.MjModel, ids: Array) -> None:
+        """Judge hits on the geoms `ids` (G,) of a model, by their number in it; -1 and G miss."""
+        self._model, self._ids = model, ids
+        self.is_field = np.append(model.geom_type[ids] == _HFIELD, False)
+        self._is_one_sided = self.is_field | np.append(model.geom_type[ids] == _MESH, False)
         self.is_needed = bool(self._is_one_sided.any())
-        """True if the model has a mesh or a height field."""
-        self._pos, self._mat = pos, mat.reshape(-1, 3, 3)
+        """True if there is a mesh or a height field."""
 
     def passed(
         self,
         origins: Array,
         directions: Array,
-        distances: Array,
-        normals: Array,
+        hits: Hits,
         geoms: Array,
-        poses: tuple[Any, Any] | None = None,
+        envs: Array,
+        pos: Array,
+        mat: Array,
     ) -> Array:
-        """Return which hits (n, R) do not count; vectors are (n, R, 3), geoms -1 for a miss.
+        """Return which hits (n, R) do not count, bool.
 
-        `poses` are the positions (n, ngeom, 3) and orientations (n, ngeom, 3, 3) of the geoms,
-        where height fields are carried.
+        Args:
+            origins: (n, R, 3). directions: (n, R, 3).
+            hits: What the rays met.
+            geoms: Numbers of the geoms that they met, (n, R).
+            envs: Environment of each row, (n,).
+            pos: Positions of the geoms, (N, G, 3), read of height fields only.
+            mat: Orientations, (N, G, 3, 3).
         """
+        normals = hits.normals
         passed = self._is_one_sided[geoms]
         passed &= np.einsum("...k,...k", normals, directions) >= 0.0
-        at = np.nonzero(self._is_field[geoms] & ~passed)
+        at = np.nonzero(self.is_field[geoms] & ~passed)
         if not len(at[0]):
             return passed
         fields = geoms[at]
-        if poses is None:
-            pos, mat = self._pos[fields], self._mat[fields]
-        else:
-            pos, mat = poses[0][at[0], fields], poses[1][at[0], fields]
+        pos, mat = (pose[envs[at[0]], fields] for pose in (pos, mat))
         up = np.einsum("mk,mk->m", normals[at], mat[:, :, 2])
-        points = origins[at] + directions[at] * distances[at][:, None] - pos
+        points = origins[at] + directions[at] * hits.distances[at][:, None] - pos
         local = np.einsum("mkj,mk->jm", mat, points)
         # Rays from below the surface end on the base, which looks like flat ground.
         is_low = np.abs(local[2]) < _BASE_TOLERANCE
-        surface, _ = _elevation(self._model, fields[is_low], local[:2, is_low])
+        surface, _ = _elevation(self._model, self._ids[fields[is_low]], local[:2, is_low])
         is_low[is_low] = surface > _SURFACE_TOLERANCE
         passed[at] = (up <= _SIDE) | is_low
         return passed
@@ -376,30 +376,27 @@ class GroundTable:
         self._origin = origin - self._edge
         self._shape = np.ceil(extent / self._edge).astype(int) + 2
 
-        def areas(first: Array, end: Array) -> list[tuple[slice, slice]]:
-            first, end = (np.clip(c, 0, self._shape).astype(int) for c in (first, end))
-            return [np.s_[a:c, b:d] for (a, b), (c, d) in zip(first, end, strict=True)]
-
         low, high = (low - self._origin) / self._edge, (high - self._origin) / self._edge
-        touched = areas(np.floor(low - 1e-6), np.floor(high + 1e-6) + 1)
-        covered = areas(np.ceil(low), np.floor(high))
+        # Areas of cells that geoms touch, [start, end) along x and y.
+        start = np.clip(np.floor(low - 1e-6), 0, self._shape).astype(int)
+        end = np.clip(np.floor(high + 1e-6) + 1, 0, self._shape).astype(int)
+        cells = np.arange(self._shape.prod())
+        grid = cells.reshape(self._shape)
+        touched = [grid[a:c, b:d].ravel() for (a, b), (c, d) in zip(start, end, strict=True)]
+        cell = np.concatenate(touched)
+        entries = np.repeat(np.arange(len(geoms)), [len(area) for area in touched])
+        entries = entries[np.argsort(cell, kind="stable")]
+        count = np.bincount(cell, minlength=len(cells))
+        ends = count.cumsum()
         # Lists end with an entry for no geom, whose values are NaN, so that nothing is met there.
-        count = np.ones(self._shape, dtype=np.int64)
-        for area in touched:
-            count[area] += 1
-        first = count.cumsum().reshape(self._shape) - count
-        place = first.copy()
-        self._entries = np.full(count.sum(), len(geoms), dtype=np.int32)
-        covering = np.full(self._shape, len(geoms), dtype=np.int32)
-        for i, (area, inner) in enumerate(zip(touched, covered, strict=True)):
-            # Boxes are listed by their surface, a field by its summit.
-            is_highest = place[inner] == first[inner]
-            if is_field[i]:
-                is_highest &= count[inner] == 2
-            covering[inner][is_highest] = i
-            self._entries[place[area]] = i
-            place[area] += 1
-        self._first, self._covering = first.ravel(), covering.ravel()
+        self._entries = np.insert(entries, ends, len(geoms)).astype(np.int32)
+        self._first = ends - count + cells
+        # Boxes are listed by their surface, a field by its summit.
+        highest, place = self._entries[self._first], np.stack(np.unravel_index(cells, self._shape))
+        covers = np.append(~is_field, False)[highest] | (count == 1)
+        covers &= (place >= low.T.take(highest, axis=1, mode="clip")).all(axis=0)
+        covers &= (place + 1 <= high.T.take(highest, axis=1, mode="clip")).all(axis=0)
+        self._covering = np.where(covers, highest, len(geoms))
         self._geoms = np.append(geoms, -1).astype(np.int32)
         self._is_field = np.append(is_field, False)
         self._pos = np.column_stack((pos.T, [np.nan] * 3))
@@ -498,52 +495,3 @@ def _static_fields(model: mujoco.MjModel, geoms: Array) -> dict[str, tuple[Array
     ids |= {"body_pos": bodies, "body_quat": bodies, "geom_rgba": geoms[materials < 0]}
     ids |= {"mat_rgba": np.unique(materials[materials >= 0])}
     return {name: (index, getattr(model, name)[index]) for name, index in ids.items()}
-
-
-def slot_model(model: mujoco.MjModel, slot_types: list[int]) -> mujoco.MjModel:
-    """Compile a world of one placeholder geom for each slot, with the surfaces of `model`.
-
-    Raises:
-        ValueError: a mesh of `model` cannot be compiled again.
-    """
-    spec = mujoco.MjSpec()
-    names = {_HFIELD: ("hfieldname", "field0"), _MESH: ("meshname", "mesh0")}
-    for i in range(model.nhfield if _HFIELD in slot_types else 0):
-        rows, columns = int(model.hfield_nrow[i]), int(model.hfield_ncol[i])
-        data = model.hfield_data[model.hfield_adr[i] :][: rows * columns]
-        spec.add_hfield(
-            name=f"field{i}", nrow=rows, ncol=columns, size=model.hfield_size[i], userdata=data
-        )
-    for i in range(model.nmesh if _MESH in slot_types else 0):
-        spec.add_mesh(
-            name=f"mesh{i}",
-            uservert=model.mesh_vert[model.mesh_vertadr[i] :][: model.mesh_vertnum[i]].ravel(),
-            userface=model.mesh_face[model.mesh_faceadr[i] :][: model.mesh_facenum[i]].ravel(),
-            # An open mesh has no volume.
-            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
-        )
-    for kind in slot_types:
-        geom = spec.worldbody.add_geom(type=_T(kind), size=[0.1, 0.1, 0.1])
-        if kind in names:
-            setattr(geom, *names[kind])
-    compiled = spec.compile()
-    # The compiler would center and stretch surfaces a second time.
-    if _HFIELD in slot_types:
-        compiled.hfield_data[:] = model.hfield_data
-    if _MESH in slot_types:
-        _copy_meshes(model, compiled)
-    compiled.geom_sameframe[:] = 0
-    return compiled
-
-
-def _copy_meshes(source: mujoco.MjModel, target: mujoco.MjModel) -> None:
-    """Copy what rays read of meshes; ValueError if the two models have not the same meshes."""
-    for name in ("mesh_vertadr", "mesh_vertnum", "mesh_face", "mesh_bvhnum"):
-        if not np.array_equal(getattr(source, name), getattr(target, name)):
-            raise ValueError(f"{name} of a mesh has changed.")
-    target.mesh_vert[:] = source.mesh_vert
-    # The trees over the faces of each mesh stand between others.
-    spans = zip(source.mesh_bvhadr, target.mesh_bvhadr, source.mesh_bvhnum, strict=True)
-    for start, end, count in spans:
-        for name in ("bvh_child", "bvh_nodeid", "bvh_depth", "bvh_aabb"):
-            getattr(target, name)[end : end + count] = getattr(source, name)[start : start + count]

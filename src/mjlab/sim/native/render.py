@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -17,7 +16,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from mujoco.batch import SimulationError
 
 from mjlab.sim.engine import (
     BACKGROUND,
@@ -27,13 +25,14 @@ from mjlab.sim.engine import (
     far_limit,
     rendered_geoms,
 )
-from mjlab.sim.native.rays import CullingRule, Hits, Passed, cast_through, slot_model
+from mjlab.sim.native.rays import CullingRule, Hits, Passed, cast_through
 from mjlab.sim.native.textures import (
     BOX,
     CAPSULE,
     CYLINDER,
     ELLIPSOID,
     HFIELD,
+    KINDS,
     MESH,
     PLANE,
     SPHERE,
@@ -48,7 +47,7 @@ _RAYS_AT_A_TIME = 131_072
 _GEOM_TYPE = int(mujoco.mjtObj.mjOBJ_GEOM)
 
 ReadField = Callable[[str], torch.Tensor]
-"""A field by name, of n environments: (n, ...), or (1, ...) if they share it."""
+"""A field of `MjData` or `MjModel` by name, of n environments: (n, ...), (1, ...) if they share it."""
 
 
 class NativeRenderer:
@@ -59,7 +58,7 @@ class NativeRenderer:
         model: mujoco.MjModel,
         num_envs: int,
         num_threads: int,
-        make_batch: Callable[[mujoco.MjModel, int, int], Any],
+        make_batch: Callable[..., Any],
         data_field: ReadField,
         expanded: Mapping[str, torch.Tensor],
     ) -> None:
@@ -73,9 +72,9 @@ class NativeRenderer:
             data_field: Returns a field of `MjData` by name, (N, ...).
             expanded: The fields of `MjModel` that differ between environments, (N, ...).
         """
-        self._model, self._num_envs, self._make_batch = model, num_envs, make_batch
+        self._model, self._num_envs = model, num_envs
         self._num_workers = min(num_threads, num_envs)
-        self._threads_each = num_threads // self._num_workers
+        self._make_batch = partial(make_batch, num_threads=num_threads // self._num_workers)
         self._data_field, self._expanded = data_field, expanded
         self._shared: dict[str, torch.Tensor] = {}
         self._views: dict[CameraView, list[_View]] = {}
@@ -88,11 +87,12 @@ class NativeRenderer:
             self._data_field(name)
         for name in ("light_xpos", "light_xdir") if self._model.nlight else ():
             self._data_field(name)
-        by_view = [self._workers(view) for view in views]
         # Threads of torch, which wait for each other by spinning, would be in the way.
-        threads = torch.get_num_threads()
+        threads, default = torch.get_num_threads(), torch.get_default_dtype()
         torch.set_num_threads(1)
+        torch.set_default_dtype(torch.float32)
         try:
+            by_view = [self._workers(view) for view in views]
             jobs = [
                 self._pool.submit(self._work, worker, number)
                 for workers in by_view
@@ -102,6 +102,7 @@ class NativeRenderer:
                 job.result()
         finally:
             torch.set_num_threads(threads)
+            torch.set_default_dtype(default)
         return [workers[0].images for workers in by_view]
 
     def _workers(self, view: CameraView) -> list[_View]:
@@ -111,13 +112,10 @@ class NativeRenderer:
                 images = Images.empty(view, self._num_envs, "cpu")
             share = -(-self._num_envs // self._num_workers)
             self._views[view] = [
-                _View(self._model, view, images, share, self._make_small_batch)
+                _View(self._model, view, images, share, self._make_batch)
                 for _ in range(self._num_workers)
             ]
         return self._views[view]
-
-    def _make_small_batch(self, model: mujoco.MjModel, count: int) -> Any:
-        return self._make_batch(model, count, self._threads_each)
 
     def _work(self, view: _View, number: int) -> None:
         """Render the share of worker `number`."""
@@ -128,15 +126,13 @@ class NativeRenderer:
         with torch.inference_mode(False), torch.no_grad():
             for start in range(number * step, self._num_envs, self._num_workers * step):
                 envs = slice(start, min(start + step, self._num_envs))
-                data, model = partial(self._read_data, envs), partial(self._read_model, envs)
-                view.render(envs, data, model, lens_varies)
+                view.render(envs, partial(self._read, envs), lens_varies)
 
-    def _read_data(self, envs: slice, name: str) -> torch.Tensor:
-        return self._data_field(name)[envs]
-
-    def _read_model(self, envs: slice, name: str) -> torch.Tensor:
+    def _read(self, envs: slice, name: str) -> torch.Tensor:
         if name in self._expanded:
             return self._expanded[name][envs]
+        if not hasattr(self._model, name):
+            return self._data_field(name)[envs]
         if name not in self._shared:
             values = torch.tensor(getattr(self._model, name)[None])
             self._shared[name] = values.float() if values.is_floating_point() else values
@@ -145,7 +141,7 @@ class NativeRenderer:
 
 def render_problem(model: mujoco.MjModel) -> str | None:
     """Return why cameras do not work in a model on this engine, and what to do; None if they do."""
-    kinds = set(model.geom_type.tolist()) - {*_EXTENTS}
+    kinds = set(model.geom_type.tolist()) - KINDS
     names = sorted(mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower() for kind in kinds)
     if model.nflex:
         names.append("flexes")
@@ -169,6 +165,10 @@ class Geoms:
     """Orientation, (n, G, 3, 3)."""
     size: torch.Tensor
     """Size, (n, G, 3)."""
+    center: torch.Tensor
+    """Center of a box around the geom, in the frame of the geom, (n, G, 3)."""
+    half: torch.Tensor
+    """Half extents of the box, (n, G, 3)."""
     dataid: torch.Tensor
     """Height field or mesh, or -1, (n, G) int32."""
     material: torch.Tensor
@@ -214,26 +214,25 @@ class _View:
         self._sight = _Sight(model, self._ids[:-1], kinds, self._lens)
         self._far = far_limit(model) or np.inf
         self.envs_at_a_time = min(num_envs, max(1, _RAYS_AT_A_TIME // self._lens.num_rays))
-        self._make_slots = partial(_Slots, model, kinds, make_batch)
-        self._slots = self._make_slots(
-            self.envs_at_a_time * self._lens.num_tiles, self._lens.tile_rays
-        )
-        self._shadow_slots: _Slots | None = None
+        make_slots, rows = partial(_Slots, model, kinds, make_batch), self.envs_at_a_time
+        self._slots = make_slots(rows * self._lens.num_tiles, self._lens.tile_rays)
+        # Shadow rays go past all geoms, not those in sight of a tile.
+        self._shadow_slots = make_slots(rows, self._lens.num_rays) if view.use_shadows else None
         self._shading = _Shading(model, kinds, view.use_textures)
         self._aimed: _Rays | None = None
-        self._rule = CullingRule(model, np.zeros((model.ngeom, 3)), np.zeros((model.ngeom, 9)))
+        self._rule = CullingRule(model, self._ids[:-1].numpy())
         self._has_fields = HFIELD in kinds
-        self._has_backs = self._has_fields or MESH in kinds or self._lens.is_orthographic
+        self._has_backs = self._rule.is_needed or self._lens.is_orthographic
 
-    def render(self, envs: slice, data: ReadField, model: ReadField, lens_varies: bool) -> None:
-        """Render the environments `envs`, whose fields `data` and `model` return.
+    def render(self, envs: slice, read: ReadField, lens_varies: bool) -> None:
+        """Render the environments `envs`, whose fields `read` returns.
 
         `lens_varies` says whether rays differ between environments.
         """
         view, lens, images, slots = self._view, self._lens, self.images, self._slots
-        pos, mat = data("cam_xpos")[:, view.camera_id], data("cam_xmat")[:, view.camera_id]
-        rays = lens.rays_of(model) if lens_varies else lens.rays
-        geoms = self._sight.pose(data, model, pos, mat)
+        pos, mat = read("cam_xpos")[:, view.camera_id], read("cam_xmat")[:, view.camera_id]
+        rays = lens.rays_of(read) if lens_varies else lens.rays
+        geoms = self._sight.pose(read, pos, mat)
         n = len(pos)
         rows = n * lens.num_tiles
         slots.load(geoms, self._sight.by_tile(geoms, rays).reshape(rows, -1))
@@ -241,14 +240,12 @@ class _View:
             self._aimed = rays
             slots.aim(rays.directions, rays.origins)
         passed = self._passed(geoms, slots) if self._has_backs else None
-        slots.cast(rows, passed, normals="rgb" in view.data_types)
+        slots.cast(rows, passed)
         distances = torch.from_numpy(slots.hits.distances[:rows]).view(n, -1)
         depth = -distances * rays.directions[..., 2]
         missed = ~((depth >= 0.0) & (depth <= self._far))
         if images.depth is not None:
             lens.copy_to_image(depth.masked_fill(missed, 0.0)[..., None], images.depth[envs])
-        if view.data_types == ("depth",):
-            return
         columns = slots.columns(slice(rows), slots.hits.geoms[:rows]).view(n, -1)
         columns.masked_fill_(missed, len(self._ids) - 1)
         if images.segmentation is not None:
@@ -262,8 +259,8 @@ class _View:
                 points += rays.origins.permute(2, 0, 1)
             normals = torch.from_numpy(slots.hits.normals[:rows]).view(n, -1, 3).permute(2, 0, 1)
             met = Surfaces(directions, points, normals.contiguous(), columns)
-            shadow = self._shadow_of(geoms) if view.use_shadows else None
-            rgb = self._shading.shade(met, geoms, pos, mat, data, model, shadow)
+            shadow = self._shadow_slots and self._shadow_of(geoms, self._shadow_slots)
+            rgb = self._shading.shade(met, geoms, pos, mat, read, shadow)
             lens.copy_to_image(rgb, images.rgb[envs])
 
     def _passed(self, geoms: Geoms, slots: _Slots, *, is_shadow: bool = False) -> Passed:
@@ -273,31 +270,21 @@ class _View:
         out of its sight. It is looked at hit by hit for meshes, height fields and parallel rays.
         Of shadow rays, only those on height fields, of which only the top is in the way.
         """
-        ids, rows_per_env = self._ids.numpy(), slots.num_rows // self.envs_at_a_time
-        # By ids of the model, as the rule wants them, which reads poses of height fields only.
-        n = len(geoms.pos) if self._has_fields else 0
-        pos = np.zeros((n, self._model.ngeom, 3), np.float32)
-        mat = np.zeros((n, self._model.ngeom, 3, 3), np.float32)
-        if n:
-            pos[:, ids[:-1]], mat[:, ids[:-1]] = geoms.pos, geoms.mat
+        rows_per_env = slots.num_rows // self.envs_at_a_time
+        pos, mat = geoms.pos.numpy(), geoms.mat.numpy()
 
-        def passed(rows: Any, origins: np.ndarray, directions: np.ndarray, hits: Hits):
-            rows = np.arange(slots.num_rows)[rows]
-            met = ids[slots.columns(rows, hits.geoms).numpy()]
-            envs = rows // rows_per_env
-            poses = (pos[envs], mat[envs]) if n else None
-            backs = self._rule.passed(origins, directions, hits.distances, hits.normals, met, poses)
+        def passed(rows: np.ndarray, origins: np.ndarray, directions: np.ndarray, hits: Hits):
+            met, envs = slots.columns(rows, hits.geoms).numpy(), rows // rows_per_env
+            backs = self._rule.passed(origins, directions, hits, met, envs, pos, mat)
             if is_shadow:
-                return backs & np.append(self._model.geom_type == HFIELD, False)[met]
+                return backs & self._rule.is_field[met]
             return backs | (np.einsum("...k,...k", hits.normals, directions) > 0.0)
 
         return passed
 
-    def _shadow_of(self, geoms: Geoms) -> Callable[..., torch.Tensor]:
-        """Return what casts shadow rays, which go past all geoms."""
-        if self._shadow_slots is None:
-            self._shadow_slots = self._make_slots(self.envs_at_a_time, self._lens.num_rays)
-        slots, n = self._shadow_slots, len(geoms.pos)
+    def _shadow_of(self, geoms: Geoms, slots: _Slots) -> Callable[..., torch.Tensor]:
+        """Return what casts shadow rays."""
+        n = len(geoms.pos)
         slots.load(geoms, geoms.exists)
         passed = self._passed(geoms, slots, is_shadow=True) if self._has_fields else None
 
@@ -305,7 +292,7 @@ class _View:
             origins: torch.Tensor, directions: torch.Tensor, limit: torch.Tensor
         ) -> torch.Tensor:
             slots.aim(directions.permute(1, 2, 0), origins.permute(1, 2, 0))
-            slots.cast(n, passed, normals=False)
+            slots.cast(n, passed)
             distances = torch.from_numpy(slots.hits.distances[:n])
             return (distances >= 0.0) & (distances < limit)
 
@@ -346,15 +333,12 @@ class _Lens:
         self.num_rays = self.num_tiles * self.tile_rays
         x = torch.arange(self.columns * tile_width).clamp(max=width - 1)
         y = torch.arange(self.rows * tile_height).clamp(max=height - 1)
-        self._x_edges, self._y_edges = (
-            ((p.view(-1, size)[:, [0, -1]].t() + 0.5) / length).reshape(-1)
-            for p, size, length in ((x, tile_width, width), (y, tile_height, height))
-        )
         # Inward normals of the planes in `_Rays`, x and y: to the right, to the left, down, up.
         self._normals = torch.tensor([[1.0, -1, 0, 0], [0, 0, -1, 1]]).repeat_interleave(
             torch.tensor([self.columns, self.columns, self.rows, self.rows]), dim=1
         )
         shape = (self.rows, tile_height, self.columns, tile_width)
+        self._tiles = (-1, self.rows, self.columns, tile_height, tile_width)
         pixels = (y[:, None] * width + x[None, :]).view(shape).transpose(1, 2).reshape(-1)
         self._u, self._v = (pixels % width + 0.5) / width, (pixels // width + 0.5) / height
         # Where each pixel of the image is among the rays. One that is repeated is in several.
@@ -367,9 +351,9 @@ class _Lens:
         self.rays = self.rays_of(lambda name: torch.tensor(getattr(model, name)[None]).float())
         """Rays of all environments, unless these differ in `LENS_FIELDS`."""
 
-    def rays_of(self, model: ReadField) -> _Rays:
-        """Compute the rays of n environments, whose fields of `MjModel` `model` returns."""
-        left, right, bottom, top = self._frustum(model)
+    def rays_of(self, read: ReadField) -> _Rays:
+        """Compute the rays of n environments, whose fields `read` returns."""
+        left, right, bottom, top = self._frustum(read)
         x, y = left + (right - left) * self._u, top + (bottom - top) * self._v
         one, none = torch.ones_like(x), torch.zeros_like(x)
         if self.is_orthographic:
@@ -378,19 +362,21 @@ class _Lens:
         else:
             directions, origins = torch.stack((x, y, -one), dim=-1), None
             directions /= directions.norm(dim=-1, keepdim=True)
-        x, y = left + (right - left) * self._x_edges, top + (bottom - top) * self._y_edges
-        edges = self._normals.sum(dim=0) * torch.cat((x, y), dim=1)
+        # The outermost rays of each column and row of tiles.
+        x, y = (values.view(self._tiles)[..., [0, -1], [0, -1]] for values in (x, y))
+        edges = torch.cat((x[:, 0].mT.flatten(1), y[:, :, 0].mT.flatten(1)), dim=1)
+        edges *= self._normals.sum(dim=0)
         normals, none = self._normals.expand(len(edges), -1, -1), torch.zeros_like(edges[:, None])
         if self.is_orthographic:
             return _Rays(directions, origins, torch.cat((normals, none), dim=1), -edges[:, None])
         return _Rays(directions, origins, torch.cat((normals, edges[:, None]), dim=1), none)
 
-    def _frustum(self, model: ReadField) -> tuple[torch.Tensor, ...]:
+    def _frustum(self, read: ReadField) -> tuple[torch.Tensor, ...]:
         """Return the sides (n, 1) of the image: left, right, bottom, top.
 
         They are those at a distance of 1 m, unless rays are parallel.
         """
-        fovy = model("cam_fovy")[:, self._id, None]
+        fovy = read("cam_fovy")[:, self._id, None]
         aspect = self._size[0] / self._size[1]
         width, height = self._sensor_size
         if self.is_orthographic or height == 0.0:
@@ -398,7 +384,7 @@ class _Lens:
             return -half * aspect, half * aspect, -half, half
         # The part of the sensor that has the shape of the image.
         width, height = min(width, height * aspect), min(height, width / aspect)
-        fx, fy, cx, cy = model("cam_intrinsic")[:, self._id, :, None].unbind(dim=1)
+        fx, fy, cx, cy = read("cam_intrinsic")[:, self._id, :, None].unbind(dim=1)
         return (
             (cx - 0.5 * width) / fx,
             (cx + 0.5 * width) / fx,
@@ -411,17 +397,6 @@ class _Lens:
         torch.index_select(values, 1, self._place, out=out.view(len(out), -1, *out.shape[3:]))
 
 
-# How the half extents of a geom follow from its size; those of meshes and height fields do not.
-_EXTENTS = {
-    PLANE: ((1, 0, 0), (0, 1, 0), (0, 0, 0)),
-    HFIELD: ((0, 0, 0),) * 3,
-    SPHERE: ((1, 0, 0), (1, 0, 0), (1, 0, 0)),
-    CAPSULE: ((1, 0, 0), (1, 0, 0), (1, 1, 0)),
-    ELLIPSOID: ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-    CYLINDER: ((1, 0, 0), (1, 0, 0), (0, 1, 0)),
-    BOX: ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-    MESH: ((0, 0, 0),) * 3,
-}
 # Axes along which a convex geom is round.
 _ROUND = {SPHERE: (1, 1, 1), CAPSULE: (1, 1, 1), ELLIPSOID: (1, 1, 1), CYLINDER: (1, 1, 0)}
 # The color of a geom that has none of its own, so that its material's color shows.
@@ -441,48 +416,44 @@ class _Sight:
         """Take the geoms `ids` (G,), of types `kinds` (G,), of a model."""
         self._ids, self._lens = ids, lens
         self._bodies = torch.tensor(model.geom_bodyid).long()[ids]
-        self._extents = torch.tensor([_EXTENTS[k] for k in kinds.tolist()]).float().view(-1, 3, 3)
         self._round = torch.tensor([_ROUND.get(k, (0, 0, 0)) for k in kinds.tolist()]).view(-1, 3)
         self._is_convex = torch.isin(kinds, torch.tensor((*_ROUND, BOX)))
         self._is_capsule = kinds == CAPSULE
         self._planes = (kinds == PLANE).nonzero().flatten()
-        # Boxes, as center and half extents. A height field reaches from its base to its top.
-        x, y, top, base = model.hfield_size.T
-        fields = np.stack((0 * x, 0 * y, (top - base) / 2, x, y, (top + base) / 2), axis=-1)
-        self._boxes = [
-            ((kinds == kind).nonzero().flatten(), torch.tensor(boxes).float())
-            for kind, boxes in ((MESH, model.bvh_aabb[model.mesh_bvhadr]), (HFIELD, fields))
-            if kind in kinds
-        ]
+        self._has_asset = torch.isin(kinds, torch.tensor((HFIELD, MESH)))
 
-    def pose(
-        self, data: ReadField, model: ReadField, pos: torch.Tensor, mat: torch.Tensor
-    ) -> Geoms:
+    def pose(self, read: ReadField, pos: torch.Tensor, mat: torch.Tensor) -> Geoms:
         """Place the geoms in the frame of a camera at `pos` (n, 3) and `mat` (n, 3, 3)."""
-        body_quat = data("xquat")[:, self._bodies]
+        body_quat = read("xquat")[:, self._bodies]
         to_camera = quat_conjugate(quat_from_matrix(mat))[:, None].expand_as(body_quat)
         in_camera = quat_mul(to_camera, body_quat)
-        arm = matrix_from_quat(in_camera) @ model("geom_pos")[:, self._ids, :, None]
-        quat = quat_mul(in_camera, model("geom_quat")[:, self._ids].expand_as(body_quat))
-        size = model("geom_size")[:, self._ids].expand(len(pos), -1, -1)
-        dataid = model("geom_dataid")[:, self._ids].expand(len(pos), -1)
+        arm = matrix_from_quat(in_camera) @ read("geom_pos")[:, self._ids, :, None]
+        quat = quat_mul(in_camera, read("geom_quat")[:, self._ids].expand_as(body_quat))
+        size = read("geom_size")[:, self._ids].expand(len(pos), -1, -1)
+        dataid = read("geom_dataid")[:, self._ids].expand(len(pos), -1)
         # Where environments hold different things, one that is not there has no shape or no size.
-        exists = size[..., 0] > 0.0
+        exists = torch.where(self._has_asset, dataid >= 0, size[..., 0] > 0.0)
         exists[:, self._planes] = True
-        for columns, _ in self._boxes:
-            exists[:, columns] = dataid[:, columns] >= 0
-        rgba, material = model("geom_rgba")[:, self._ids], model("geom_matid")[:, self._ids].long()
+        center, half = read("geom_aabb")[:, self._ids].expand(len(pos), -1, -1).split(3, dim=-1)
+        # MuJoCo's boxes of planes are too large for single precision.
+        center, half = center.clone(), half.clone()
+        center[:, self._planes], half[:, self._planes, 2] = 0.0, 0.0
+        sides = size[:, self._planes, :2]
+        half[:, self._planes, :2] = sides.masked_fill(sides <= 0.0, _ENDLESS)
+        rgba, material = read("geom_rgba")[:, self._ids], read("geom_matid")[:, self._ids].long()
         has_none = (rgba == torch.tensor(_NO_COLOR)).all(dim=-1) & (material >= 0)
-        of_material = of_materials(model("mat_rgba"), material, 0.0)
+        of_material = of_materials(read("mat_rgba"), material, 0.0)
         rgba = torch.where(has_none[..., None], of_material, rgba)
         return Geoms(
-            pos=(data("xpos")[:, self._bodies] - pos[:, None]) @ mat + arm.squeeze(-1),
+            pos=(read("xpos")[:, self._bodies] - pos[:, None]) @ mat + arm.squeeze(-1),
             quat=quat,
             mat=matrix_from_quat(quat),
             size=size,
             dataid=dataid,
             material=material,
             rgba=rgba,
+            center=center,
+            half=half,
             exists=exists & (rgba[..., 3] != 0.0),
         )
 
@@ -491,22 +462,15 @@ class _Sight:
 
         A box around a geom is in sight of a tile unless it lies beyond one of the tile's sides.
         """
-        half = torch.einsum("gij,ngj->ngi", self._extents, geoms.size)
         visible = geoms.exists
         if rays.origins is None:
-            visible = visible & ~self._around(geoms, half)
-        sides = half[:, self._planes, :2]
-        half[:, self._planes, :2] = sides.masked_fill(sides <= 0.0, _ENDLESS)
-        middle = geoms.pos
-        for columns, boxes in self._boxes:
-            center, half[:, columns] = boxes[geoms.dataid[:, columns].long()].split(3, dim=-1)
-            turned = (geoms.mat[:, columns] @ center[..., None]).squeeze(-1)
-            middle = middle.index_add(1, columns, turned)
+            visible = visible & ~self._around(geoms)
+        middle = geoms.pos + (geoms.mat @ geoms.center[..., None]).squeeze(-1)
         # One factor for all makes a single product.
         planes = rays.planes[0] if len(rays.planes) == 1 else rays.planes
         axes = geoms.mat.transpose(-1, -2).reshape(len(geoms.mat), -1, 3)
         along = (axes @ planes).abs_().unflatten(1, (-1, 3))
-        reach = (along * half[..., None]).sum(dim=2)
+        reach = (along * geoms.half[..., None]).sum(dim=2)
         reach *= 1.0 + _SLACK
         reach += middle @ planes + rays.plane_offsets
         reach += _SLACK_METRES + _SLACK * middle.abs().amax(dim=-1, keepdim=True)
@@ -515,16 +479,16 @@ class _Sight:
         left, right, top, bottom = inside.transpose(1, 2).split((columns, columns, rows, rows), 1)
         return (top & bottom)[:, :, None] & (left & right)[:, None]
 
-    def _around(self, geoms: Geoms, half: torch.Tensor) -> torch.Tensor:
+    def _around(self, geoms: Geoms) -> torch.Tensor:
         """Return the convex geoms (n, G) that the camera is in, whose backs it does not see.
 
         Along each axis, the camera is at x of the extent beyond the core, which is a point but for
         capsules: |x| < 1 along the flat ones, and the norm of the round ones < 1.
         """
         local = (geoms.pos[..., None, :] @ geoms.mat).squeeze(-2).abs()
-        core = torch.zeros_like(half)
+        core = torch.zeros_like(geoms.half)
         core[..., 2] = torch.where(self._is_capsule, geoms.size[..., 1], 0.0)
-        x = (local - core).clamp_(min=0.0) / (half - core)
+        x = (local - core).clamp_(min=0.0) / (geoms.half - core)
         norm = (x.square() * self._round).sum(dim=-1)
         return self._is_convex & (x < 1.0).all(dim=-1) & (norm < 1.0)
 
@@ -561,7 +525,6 @@ class _Slots:
         self._origins, self._directions = np.zeros((rows, rays, 3)), np.zeros((rows, rays, 3))
         self.hits = Hits.empty(rows, rays)
         """What the rays met; its geoms are slots."""
-        self.hits.distances.fill(-1.0)
 
     def load(self, geoms: Geoms, in_sight: torch.Tensor) -> None:
         """Put into each row the geoms that are in its sight: (rows, G) bool, rows by environment.
@@ -593,11 +556,9 @@ class _Slots:
         """Have at least so many slots."""
         if self._width and slots <= self._width:
             return
-        # The assets of the model come with a geom that has one.
-        kinds = [kind for kind in (HFIELD, MESH) if kind in self._kinds]
-        self._width = max(1, len(kinds), min(len(self._kinds), int(_HEADROOM * slots) + 1))
-        kinds += [SPHERE] * (self._width - len(kinds))
-        self._batch = self._make_batch(slot_model(self._model, kinds), self.num_rows)
+        self._width = max(1, min(len(self._kinds), int(_HEADROOM * slots) + 1))
+        model = _slot_model(self._model, {*self._kinds.tolist()}, self._width)
+        self._batch = self._make_batch(model, self.num_rows)
         names = ("geom_pos", "geom_quat", "geom_size", "geom_dataid", "geom_type", "geom_group")
         self._values = {name: torch.from_numpy(self._batch.expand(name)) for name in names}
         self._values["geom_group"].fill_(_EMPTY)
@@ -611,19 +572,9 @@ class _Slots:
                 by_env = torch.from_numpy(target).view(-1, *source.shape[1:])
                 by_env[: n if n > 1 else None] = source
 
-    def cast(self, rows: int, passed: Passed | None, *, normals: bool) -> None:
-        """Cast the rays of the first `rows` simulations into `hits`.
-
-        `passed` says which hits do not count. Without `normals`, they need not be computed.
-        """
+    def cast(self, rows: int, passed: Passed | None) -> None:
+        """Cast the rays of the first `rows` simulations; `passed` says which hits do not count."""
         ids = None if rows == self.num_rows else np.arange(rows)
-        if passed is None and not normals:
-            # Where MuJoCo raises for one simulation, the results of the others are lost with it.
-            with suppress(SimulationError):
-                self.hits.distances[:rows], self.hits.geoms[:rows] = self._batch.ray(
-                    self._origins[:rows], self._directions[:rows], geomgroup=_MASK, ids=ids
-                )
-                return
         cast_through(
             self._batch, self._origins, self._directions, self.hits, passed, ids, geomgroup=_MASK
         )
@@ -631,6 +582,45 @@ class _Slots:
     def columns(self, rows: Any, slots: np.ndarray) -> torch.Tensor:
         """Return the numbers of the geoms in `slots` (m, rays) of some rows; G for -1."""
         return self._columns[rows].gather(1, torch.from_numpy(slots).long() + 1)
+
+
+def _slot_model(model: mujoco.MjModel, kinds: set[int], slots: int) -> mujoco.MjModel:
+    """Compile a world of placeholder geoms with the surfaces of `model`, if `kinds` have some.
+
+    Raises:
+        ValueError: a mesh of `model` cannot be compiled again.
+    """
+    spec = mujoco.MjSpec()
+    for _ in range(slots):
+        spec.worldbody.add_geom(size=[0.1, 0.1, 0.1])
+    for i in range(model.nhfield if HFIELD in kinds else 0):
+        rows, columns = int(model.hfield_nrow[i]), int(model.hfield_ncol[i])
+        size, flat = model.hfield_size[i], np.zeros(rows * columns)
+        spec.add_hfield(name=f"field{i}", nrow=rows, ncol=columns, size=size, userdata=flat)
+    for i in range(model.nmesh if MESH in kinds else 0):
+        spec.add_mesh(
+            name=f"mesh{i}",
+            uservert=model.mesh_vert[model.mesh_vertadr[i] :][: model.mesh_vertnum[i]].ravel(),
+            userface=model.mesh_face[model.mesh_faceadr[i] :][: model.mesh_facenum[i]].ravel(),
+            # An open mesh has no volume.
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+        )
+    compiled = spec.compile()
+    if HFIELD in kinds:
+        compiled.hfield_data[:] = model.hfield_data
+    if MESH in kinds:
+        # The compiler has centered and turned them a second time.
+        compiled.mesh_vert[:], compiled.mesh_face[:] = model.mesh_vert, model.mesh_face
+        target, source = (
+            slice(m.mesh_bvhadr[0], m.mesh_bvhadr[-1] + m.mesh_bvhnum[-1])
+            for m in (compiled, model)
+        )
+        for name in ("bvh_child", "bvh_nodeid", "bvh_depth", "bvh_aabb"):
+            getattr(compiled, name)[target] = getattr(model, name)[source]
+    compiled.geom_sameframe[:] = 0
+    # MuJoCo 4 lets rays pass geoms whose bounding sphere they miss; 0 is for no bound.
+    compiled.geom_rbound[:] = 0.0
+    return compiled
 
 
 # What a geom without a material reflects, and its shininess; the exponent of a shininess of 1.
@@ -641,24 +631,6 @@ _IN_SHADOW, _WITHOUT_LIGHTS = 0.3, 0.3
 _ABOVE, _BEFORE = 1e-4, 1e-3
 _SPOT = int(mujoco.mjtLightType.mjLIGHT_SPOT)
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-
-
-@dataclass
-class _Light:
-    """A light at n x P points, in the frame of the camera; n and P may be 1."""
-
-    diffuse: torch.Tensor
-    """Color, (3, n, 1)."""
-    specular: torch.Tensor
-    """Color, (3, n, 1)."""
-    direction: torch.Tensor
-    """Unit vector to the light, (3, n, P)."""
-    distance: torch.Tensor
-    """Distance to the light (m), (n, P)."""
-    strength: torch.Tensor
-    """Part that arrives, (n, P)."""
-    casts_shadow: torch.Tensor
-    """True where it does, (n, 1)."""
 
 
 class _Shading:
@@ -680,8 +652,7 @@ class _Shading:
         geoms: Geoms,
         pos: torch.Tensor,
         mat: torch.Tensor,
-        data: ReadField,
-        model: ReadField,
+        read: ReadField,
         shadow: Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor] | None,
     ) -> torch.Tensor:
         """Return the colors of the rays, (n, P, 3) uint8.
@@ -690,7 +661,7 @@ class _Shading:
             met: What the rays met.
             geoms: The geoms that they can meet.
             pos: Position of the camera, (n, 3). mat: Its orientation, (n, 3, 3).
-            data: Reads fields of `MjData`. model: Reads fields of `MjModel`.
+            read: Reads fields.
             shadow: Whether something is in the way: origins (3, n, P), directions, distances (n, P)
                 to (n, P) bool. None for no shadows.
         """
@@ -699,35 +670,39 @@ class _Shading:
         rgb = torch.nn.functional.pad(geoms.rgba.permute(2, 0, 1)[:3], (0, 1))
         rgb = of_pixels(rgb, met.columns)
         if self._use_textures:
-            self._textures.paint(rgb, met, geoms, material, model)
-        exponent = of_materials(model("mat_shininess"), material, _SHININESS) * _MAX_EXPONENT
-        reflected = of_materials(model("mat_specular"), material, _SPECULAR)
+            self._textures.paint(rgb, met, geoms, material, read)
+        exponent = of_materials(read("mat_shininess"), material, _SHININESS) * _MAX_EXPONENT
+        reflected = of_materials(read("mat_specular"), material, _SPECULAR)
         reflected = torch.where(exponent > 0.0, reflected, 0.0)
-        emission = of_materials(model("mat_emission"), material, 0.0)
+        emission = of_materials(read("mat_emission"), material, 0.0)
         brightness = torch.zeros_like(rgb)
         if emission.any():
             brightness += of_pixels(emission, met.columns)
-        brightness += self._ambient(model)
+        ambient = torch.full((3,), 0.0 if self._num_lights else _WITHOUT_LIGHTS)
+        if self._headlight.active:
+            ambient = torch.tensor(self._headlight.ambient, dtype=torch.float32)
+        own = read("light_ambient") * (read("light_active") != 0)[..., None]
+        brightness += (ambient + own.sum(dim=1)).t()[..., None]
         shines = bool(reflected.any())
         if shines:
             exponent, gloss = of_pixels(exponent, met.columns), torch.zeros_like(rgb)
             facing = -_dot(met.normals, met.directions)
-        for light in self._lights(met.points, pos, mat, data, model):
-            cosine = _dot(met.normals, light.direction).clamp_(min=0.0)
-            strength = light.strength
-            if shadow is not None and light.casts_shadow.any():
+        for diffuse, specular, direction, distance, strength, casts_shadow in self._lights(
+            met.points, pos, mat, read
+        ):
+            cosine = _dot(met.normals, direction).clamp_(min=0.0)
+            if shadow is not None and casts_shadow.any():
                 origins = met.points + _ABOVE * met.normals
-                direction = light.direction.expand_as(origins)
-                hidden = shadow(origins, direction, light.distance - _BEFORE)
-                hidden &= light.casts_shadow & (cosine > 0.0)
+                hidden = shadow(origins, direction.expand_as(origins), distance - _BEFORE)
+                hidden &= casts_shadow & (cosine > 0.0)
                 strength = strength * torch.where(hidden, _IN_SHADOW, 1.0)
-            brightness.addcmul_(cosine * strength, light.diffuse)
-            if shines and light.specular.any():
+            brightness.addcmul_(cosine * strength, diffuse)
+            if shines and specular.any():
                 # |L + V|^2 = 2 + 2 L.V, so that the direction halfway is never needed itself.
-                length = (2.0 - 2.0 * _dot(met.directions, light.direction)).clamp_(min=1e-12)
+                length = (2.0 - 2.0 * _dot(met.directions, direction)).clamp_(min=1e-12)
                 halfway = (cosine + facing).div_(length.sqrt_()).clamp_(0.0, 1.0)
                 halfway = halfway.pow_(exponent).masked_fill_(cosine <= 0.0, 0.0)
-                gloss.addcmul_(halfway.mul_(strength), light.specular)
+                gloss.addcmul_(halfway.mul_(strength), specular)
         rgb *= brightness
         if shines:
             rgb += gloss.mul_(of_pixels(reflected, met.columns))
@@ -740,61 +715,54 @@ class _Shading:
             self._textures.paint_sky(rgb, missed, world)
         return torch.stack(rgb.mul_(255.0).to(torch.uint8).unbind(), dim=-1)
 
-    def _ambient(self, model: ReadField) -> torch.Tensor:
-        """Return ambient light, (3, n, 1)."""
-        ambient = torch.zeros(1, 3)
-        if self._headlight.active:
-            ambient = torch.tensor(self._headlight.ambient, dtype=torch.float32)[None]
-        elif not self._num_lights:
-            ambient = torch.full((1, 3), _WITHOUT_LIGHTS)
-        if self._num_lights:
-            own = model("light_ambient") * (model("light_active") != 0)[..., None]
-            ambient = ambient + own.sum(dim=1)
-        return ambient.t()[..., None]
-
     def _lights(
         self,
         points: torch.Tensor,
         pos: torch.Tensor,
         mat: torch.Tensor,
-        data: ReadField,
-        model: ReadField,
-    ) -> Iterator[_Light]:
-        """Yield what each light that shines somewhere is at the points (3, n, P)."""
+        read: ReadField,
+    ) -> Iterator[tuple[torch.Tensor, ...]]:
+        """Yield what each light that shines somewhere is at the points (3, n, P).
+
+        Axes n and P may be 1. Yields:
+            Diffuse and specular color, (3, n, 1).
+            Unit vector to the light, (3, n, P), and distance (m), (n, P).
+            Part that arrives, (n, P).
+            Whether it casts shadows, (n, 1) bool.
+        """
         endless, one = torch.full((1, 1), _ENDLESS), torch.ones(1, 1)
         for i in range(self._num_lights):
 
-            def read(name: str, i: int = i) -> torch.Tensor:
-                return model(f"light_{name}")[:, i, None]
+            def own(name: str, i: int = i) -> torch.Tensor:
+                return read(f"light_{name}")[:, i, None]
 
-            active = read("active") != 0
-            diffuse = (read("diffuse").squeeze(1) * active).t()[..., None]
-            specular = (read("specular").squeeze(1) * active).t()[..., None]
+            active = own("active") != 0
+            diffuse = (own("diffuse").squeeze(1) * active).t()[..., None]
+            specular = (own("specular").squeeze(1) * active).t()[..., None]
             if not (diffuse.any() or specular.any()):
                 continue
-            axis = (data("light_xdir")[:, i, None] @ mat).permute(2, 0, 1)
+            axis = (read("light_xdir")[:, i, None] @ mat).permute(2, 0, 1)
             direction, distance, strength = -axis, endless, one
-            is_far = read("type") == _DIRECTIONAL
+            is_far = own("type") == _DIRECTIONAL
             if not is_far.all():
-                to_light = ((data("light_xpos")[:, i] - pos)[:, None] @ mat).permute(2, 0, 1)
+                to_light = ((read("light_xpos")[:, i] - pos)[:, None] @ mat).permute(2, 0, 1)
                 to_light = to_light - points
                 distance = _dot(to_light, to_light).sqrt_()
                 # MuJoCo raises for a ray without a direction, as one would be at the light itself.
                 to_light = torch.where(distance > 0.0, to_light / distance, direction)
-                constant, linear, squared = read("attenuation").permute(2, 0, 1)
+                constant, linear, squared = own("attenuation").permute(2, 0, 1)
                 strength = 1.0 / (constant + distance * (linear + distance * squared))
                 strength.masked_fill_(strength.isinf(), 0.0)
-                is_spot = read("type") == _SPOT
+                is_spot = own("type") == _SPOT
                 if is_spot.any():
                     on_axis = -_dot(axis, to_light)
-                    spot = on_axis.clamp(min=0.0).pow(read("exponent"))
-                    spot.masked_fill_(on_axis < torch.deg2rad(read("cutoff")).cos(), 0.0)
+                    spot = on_axis.clamp(min=0.0).pow(own("exponent"))
+                    spot.masked_fill_(on_axis < torch.deg2rad(own("cutoff")).cos(), 0.0)
                     strength = strength * torch.where(is_spot, spot, 1.0)
                 direction = torch.where(is_far, direction, to_light)
                 distance = torch.where(is_far, endless, distance)
                 strength = torch.where(is_far, one, strength)
-            casts_shadow = read("castshadow") != 0
-            yield _Light(diffuse, specular, direction, distance, strength, casts_shadow)
+            yield diffuse, specular, direction, distance, strength, own("castshadow") != 0
         if self._headlight.active:
             diffuse, specular = (
                 torch.tensor(color, dtype=torch.float32).view(3, 1, 1)
@@ -802,7 +770,7 @@ class _Shading:
             )
             # It shines along the optical axis.
             direction = torch.tensor([0.0, 0.0, 1.0]).view(3, 1, 1)
-            yield _Light(diffuse, specular, direction, endless, one, torch.tensor(False))
+            yield diffuse, specular, direction, endless, one, torch.tensor(False)
 
 
 def _dot(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:

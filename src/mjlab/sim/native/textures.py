@@ -6,7 +6,6 @@ its vertices shows as its mean color, because rays do not say which face of a me
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -37,18 +36,16 @@ class Textures:
     def __init__(self, model: mujoco.MjModel, kinds: torch.Tensor) -> None:
         """Take the textures of a model, for geoms of the types `kinds` (G + 1,), -1 for none."""
         self._kinds = kinds
-        texels, starts = [np.zeros((0, 3), np.uint8)], [0]
-        for i in range(model.ntex):
-            channels, start = int(model.tex_nchannel[i]), int(model.tex_adr[i])
-            count = int(model.tex_width[i] * model.tex_height[i])
+        counts, texels = model.tex_width * model.tex_height, [np.zeros((0, 3), np.uint8)]
+        for start, count, channels in zip(model.tex_adr, counts, model.tex_nchannel, strict=True):
             data = model.tex_data[start : start + count * channels].reshape(count, channels)
-            rgb = np.zeros((count, 3), np.uint8)
-            rgb[:, : min(channels, 3)] = data[:, :3]
-            texels.append(rgb)
-            starts.append(starts[-1] + count)
+            texels.append(np.pad(data[:, :3], ((0, 0), (0, 3 - min(channels, 3)))))
         self._texels = torch.from_numpy(np.concatenate(texels).T.copy()).float().div_(255.0)
-        self._starts = torch.tensor(starts, dtype=torch.int32)
-        self._means = [self._texels[:, a:b].mean(dim=1) for a, b in pairwise(starts)]
+        self._starts = torch.from_numpy(np.cumsum(counts) - counts).int()
+        # (3, ntex).
+        self._means = self._texels.new_zeros(3, model.ntex)
+        for i, part in enumerate(self._texels.split(counts.tolist(), dim=1)):
+            self._means[:, i] = part.mean(dim=1)
         self._has_coordinates = torch.tensor([*(model.mesh_texcoordadr >= 0), False])
         self._width = torch.tensor(model.tex_width, dtype=torch.int32)
         self._height = torch.tensor(model.tex_height, dtype=torch.int32)
@@ -61,18 +58,18 @@ class Textures:
         met: Surfaces,
         geoms: Geoms,
         material: torch.Tensor,
-        model: ReadField,
+        read: ReadField,
     ) -> None:
         """Multiply the colors `rgb` (3, n, P) by the textures of materials.
 
         `material` is (1 or n, G + 1): the material of each geom, -1 for none.
         """
-        texture = of_materials(model("mat_texid")[..., _RGB].long(), material, -1)
+        texture = of_materials(read("mat_texid")[..., _RGB].long(), material, -1)
         painted = (texture >= 0).any(dim=0)
         if not painted.any():
             return
-        repeat = of_materials(model("mat_texrepeat"), material, 1.0).permute(2, 0, 1)
-        uniform = of_materials(model("mat_texuniform") != 0, material, False)
+        repeat = of_materials(read("mat_texrepeat"), material, 1.0).permute(2, 0, 1)
+        uniform = of_materials(read("mat_texuniform") != 0, material, False)
         is_plane = self._kinds == PLANE
         planes = (painted & is_plane).nonzero().flatten().tolist()
         if len(planes) <= _MAX_PLANES:
@@ -110,7 +107,7 @@ class Textures:
         if self._has_coordinates.any():
             mesh = geoms.dataid[env, column].masked_fill(kinds != MESH, -1).long()
             laid = self._has_coordinates[mesh]
-            color[:, laid] = torch.stack(self._means, dim=1)[:, texture[laid]]
+            color[:, laid] = self._means[:, texture[laid]]
         rgb[:, env, pixel] *= color
 
     def paint_sky(self, rgb: torch.Tensor, missed: torch.Tensor, directions: torch.Tensor) -> None:
@@ -260,6 +257,8 @@ _MAPPINGS = {
     HFIELD: _hfield,
     MESH: _mesh,
 }
+KINDS = frozenset(_MAPPINGS)
+"""Types of geoms that cameras see."""
 
 
 def _sky_coordinates(direction: torch.Tensor, width: int) -> torch.Tensor:
