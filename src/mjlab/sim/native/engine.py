@@ -82,15 +82,14 @@ _STAGES = {
     name: int(getattr(mujoco.mjtStage, f"mjSTAGE_{name.upper()}")) for name in ("pos", "vel", "acc")
 }
 
+# Matrices of implicit integration, which only a step computes.
+_STEP_FIELDS = frozenset({"qH", "qHDiagInv", "qDeriv", "qLU"})
 # Outputs that a stage does not compute.
 _LATER_FIELDS = {
-    "pos": VELOCITY_FIELDS | ACCELERATION_FIELDS,
-    "vel": ACCELERATION_FIELDS,
-    "acc": frozenset[str](),
+    "pos": VELOCITY_FIELDS | ACCELERATION_FIELDS | _STEP_FIELDS,
+    "vel": ACCELERATION_FIELDS | _STEP_FIELDS,
+    "acc": _STEP_FIELDS,
 }
-
-# Steps for which the state before the last substep is kept; see `NativeEngine._fill`.
-_FIRST_STEPS = 100
 
 
 class NativeEngine(Engine):
@@ -130,8 +129,11 @@ class NativeEngine(Engine):
         }
         self._frame_marks: dict[str, np.ndarray] = {}
         self._bounds: Batch | None = None
-        self._before: torch.Tensor | None = None
-        self._first_steps = _FIRST_STEPS
+        # State before the last call of `Batch.step`, its substeps, and environments whose fields were
+        # computed by a `forward` since, up to the velocities and up to the accelerations.
+        self._before, self._substeps = self._batch.state.copy(), 0
+        self._has_velocities = np.ones(num_envs, dtype=bool)
+        self._has_accelerations = np.ones(num_envs, dtype=bool)
         self._has_warned = False
         threads = self._batch.nthread
         self.capabilities = Capabilities(
@@ -158,28 +160,35 @@ class NativeEngine(Engine):
                 field = self._inputs[name] = _Input(source, dtype)
             else:
                 field = _Copy(source, dtype)
-                self._fill(field)
+                self._fill(name, field)
                 self._outputs[name] = field
             self._tensors[name] = _like_mujoco(name, field.values)
         return self._tensors[name]
 
-    def _fill(self, field: _Copy) -> None:
-        """Compute a field that was just bound, which reads zero until the next call.
+    def _fill(self, name: str, field: _Copy) -> None:
+        """Compute a field that was just bound, as if it had been bound before the last step.
 
-        Between a step and the next `forward`, derived fields are one substep old. Terms read most
-        fields for the first time in the middle of the first step. So the state before the last
-        substep is kept until the first `forward` after a step, and that substep is taken once more.
-        Nothing but the field changes.
+        `Batch` has zeros there until the next call. Where no `forward` has computed the field since
+        the last step, the step is repeated from the state before it. Nothing else changes.
         """
         self._copy_in()
-        kept = self._rows.clone()
-        if self._before is None:
-            self._call(self._batch.forward)
-        else:
-            self._rows.copy_(self._before)
-            self._call(self._batch.step)
-        self._rows.copy_(kept)
-        field.copy_out()
+        kept = self._batch.state.copy()
+        is_late = name in _LATER_FIELDS["vel"] or name == "sensordata"
+        current = self._has_accelerations if is_late else self._has_velocities
+        if name in _STEP_FIELDS:
+            current = np.zeros_like(current)
+        if not current.all():
+            self._batch.state[:] = self._before
+            self._call(self._batch.step, nstep=self._substeps)
+            self._batch.state[:] = kept
+            field.copy_out()
+        for stage, chosen in (("vel", self._has_velocities), ("acc", current)):
+            # Sensors are of several stages; those of the last overwrite the others.
+            if chosen.any() and (stage == "acc" or name == "sensordata"):
+                rows = torch.from_numpy(np.flatnonzero(chosen))
+                self._call(self._batch.forward, rows, stage=_STAGES[stage])
+                self._batch.state[:] = kept
+                field.copy_out(rows, self._sensor_columns[stage] if name == "sensordata" else None)
 
     def model_field(self, name: str) -> torch.Tensor:
         if name not in self._model_tensors:
@@ -233,7 +242,7 @@ class NativeEngine(Engine):
             )
 
     def hide_geoms(self, absent: torch.Tensor) -> None:
-        # The compiler's own use of these is for bodies as a whole, and a superset does no harm.
+        # What the compiler made of these (masks of bodies) may let more geoms through.
         for name in COLLISION_MASKS:
             array = self._batch.expand(name)
             array[absent.numpy()] = 0
@@ -246,15 +255,14 @@ class NativeEngine(Engine):
         recorded = {name: field.new_empty(nstep, *field.shape) for name, field in fields.items()}
         if nstep == 0:
             return recorded
-        calls = [nstep - 1, 1] if self._first_steps and nstep > 1 else [nstep]
-        if record:
-            # Not `Batch.rollout`: it stops environments that warn, and single steps are as fast.
-            calls = [1] * nstep
-        self._first_steps = max(self._first_steps - 1, 0)
+        # Not `Batch.rollout`: it stops environments that warn, and single steps are as fast.
+        calls = [1] * nstep if record else [nstep]
         self._copy_in()
+        self._has_velocities[:] = self._has_accelerations[:] = False
         for k, count in enumerate(calls):
             is_last = k == len(calls) - 1
-            self._before = self._rows.clone() if is_last and self._first_steps else None
+            if is_last:
+                self._before[:], self._substeps = self._batch.state, count
             rows = self._call(self._batch.step, nstep=count)
             for name in self._outputs if is_last else self._outputs.keys() & recorded.keys():
                 self._outputs[name].copy_out(rows)
@@ -266,9 +274,11 @@ class NativeEngine(Engine):
         return recorded
 
     def forward(self, env_ids: torch.Tensor | None, stage: Stage = "acc") -> None:
-        if self._before is not None:
-            # A step was followed by `forward`: whatever steps read has been read once.
-            self._first_steps, self._before = 0, None
+        chosen = slice(None) if env_ids is None else env_ids.numpy()
+        if stage != "pos":
+            self._has_velocities[chosen] = True
+        if stage == "acc":
+            self._has_accelerations[chosen] = True
         # A field that is read later is computed then.
         if not self._outputs:
             return
@@ -278,13 +288,8 @@ class NativeEngine(Engine):
             self._inputs["qacc_warmstart"].copy_out(env_ids)
         # An `MjData` serves many environments: what a stage does not compute is another's.
         for name in self._outputs.keys() - _LATER_FIELDS[stage]:
-            field, columns = self._outputs[name], self._sensor_columns[stage]
-            if name == "sensordata" and columns is not None:
-                kept = field.values.clone()
-                field.copy_out(rows)
-                torch.where(columns, field.values, kept, out=field.values)
-            else:
-                field.copy_out(rows)
+            columns = self._sensor_columns[stage] if name == "sensordata" else None
+            self._outputs[name].copy_out(rows, columns)
 
     def reset(self, env_ids: torch.Tensor | None) -> None:
         self._copy_in_model()
@@ -299,8 +304,8 @@ class NativeEngine(Engine):
     ) -> torch.Tensor | None:
         """Run a method of the batch; return the environments in which MuJoCo did not raise.
 
-        None means all. The others keep their state, with which they would raise for ever. So their
-        `qpos` and `qvel` become NaN, by which the environment finds and resets them.
+        None means all. The others keep their state and would raise again. So their `qpos` and `qvel`
+        become NaN, by which the environment finds and resets them.
         """
         try:
             method(None if env_ids is None else env_ids.numpy(), **options)
@@ -323,7 +328,7 @@ class NativeEngine(Engine):
     def _copy_in_model(self) -> None:
         moved = None
         for name, field in self._model_copies.items():
-            written = field.copy_in() if field.is_versioned() else None
+            written = field.copy_in()
             if written is not None and name in _BOUNDED:
                 rows = written.flatten(1).any(dim=1)
                 moved = rows if moved is None else moved | rows
@@ -353,7 +358,6 @@ class NativeEngine(Engine):
         # mj_setConst does both parts at once; the part not asked for comes out as it was.
         self.expand(self.constants_written_by(level))
         self._copy_in()
-        self._before = None
         self._call(self._batch.set_const, env_ids)
         # It also marks frames that coincide, which may be moved apart afterwards.
         for mark in self._frame_marks.values():
@@ -469,7 +473,7 @@ class NativeEngine(Engine):
             )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._before = None
+        self._has_velocities[:] = self._has_accelerations[:] = True
         for name in state["bound"]:
             self.data_field(name)
         self.expand(tuple(state["model"]))
@@ -499,12 +503,17 @@ class _Copy:
             self.source = source
             self.values = source.to(dtype, copy=True, memory_format=torch.contiguous_format)
 
-    def copy_out(self, rows: torch.Tensor | None = None) -> None:
-        """Copy the source out: all of it, or `rows`."""
+    def copy_out(
+        self, rows: torch.Tensor | None = None, columns: torch.Tensor | None = None
+    ) -> None:
+        """Copy the source out: all of it, or `rows`, or `columns` (a mask) of a matrix."""
+        kept = None if columns is None else self.values.clone()
         if rows is None:
             self.values.copy_(self.source)
         else:
             self.values[rows] = self.source[rows].to(self.values.dtype)
+        if kept is not None:
+            torch.where(columns, self.values, kept, out=self.values)
 
 
 class _Input(_Copy):
@@ -517,12 +526,6 @@ class _Input(_Copy):
         super().__init__(source, dtype)
         with torch.inference_mode(False):
             self._seen = self.values.clone()
-        self._version = self.values._version
-
-    def is_versioned(self) -> bool:
-        """Return True if torch counted a write since the last call; misses those through numpy."""
-        seen, self._version = self._version, self.values._version
-        return self._version != seen
 
     def copy_in(self) -> torch.Tensor | None:
         """Copy elements that were written into the source; return a mask of them, None if none."""
@@ -537,7 +540,6 @@ class _Input(_Copy):
         super().copy_out(rows)
         index = slice(None) if rows is None else rows
         self._seen[index] = self.values[index]
-        self._version = self.values._version
 
 
 def _seam_type(source: torch.Tensor) -> torch.dtype:
@@ -546,6 +548,9 @@ def _seam_type(source: torch.Tensor) -> torch.dtype:
 
 def _as_tensor(array: np.ndarray[Any, Any]) -> torch.Tensor:
     """View an array as a tensor, without the warning about outputs, which are not written."""
+    if array.dtype == np.uint64:
+        # Torch has hardly any operation on it.
+        array = array.view(np.int64)
     with torch.inference_mode(False), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return torch.from_numpy(array)
