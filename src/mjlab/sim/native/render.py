@@ -397,6 +397,8 @@ class _Lens:
         torch.index_select(values, 1, self._place, out=out.view(len(out), -1, *out.shape[3:]))
 
 
+# Which of its sizes are the half extents of a geom, if not the three in order.
+_AXES = {SPHERE: (0, 0, 0), CAPSULE: (0, 0, 1), CYLINDER: (0, 0, 1)}
 # Axes along which a convex geom is round.
 _ROUND = {SPHERE: (1, 1, 1), CAPSULE: (1, 1, 1), ELLIPSOID: (1, 1, 1), CYLINDER: (1, 1, 0)}
 # The color of a geom that has none of its own, so that its material's color shows.
@@ -420,7 +422,15 @@ class _Sight:
         self._is_convex = torch.isin(kinds, torch.tensor((*_ROUND, BOX)))
         self._is_capsule = kinds == CAPSULE
         self._planes = (kinds == PLANE).nonzero().flatten()
-        self._has_asset = torch.isin(kinds, torch.tensor((HFIELD, MESH)))
+        self._axes = torch.tensor([_AXES.get(k, (0, 1, 2)) for k in kinds.tolist()]).view(-1, 3)
+        # Center and half extents. A height field reaches from its base to its top.
+        x, y, top, base = model.hfield_size.T
+        fields = np.stack((0 * x, 0 * y, (top - base) / 2, x, y, (top + base) / 2), axis=-1)
+        self._boxes = [
+            ((kinds == kind).nonzero().flatten(), torch.tensor(boxes).float())
+            for kind, boxes in ((MESH, model.bvh_aabb[model.mesh_bvhadr]), (HFIELD, fields))
+            if kind in kinds
+        ]
 
     def pose(self, read: ReadField, pos: torch.Tensor, mat: torch.Tensor) -> Geoms:
         """Place the geoms in the frame of a camera at `pos` (n, 3) and `mat` (n, 3, 3)."""
@@ -432,12 +442,16 @@ class _Sight:
         size = read("geom_size")[:, self._ids].expand(len(pos), -1, -1)
         dataid = read("geom_dataid")[:, self._ids].expand(len(pos), -1)
         # Where environments hold different things, one that is not there has no shape or no size.
-        exists = torch.where(self._has_asset, dataid >= 0, size[..., 0] > 0.0)
+        exists = size[..., 0] > 0.0
         exists[:, self._planes] = True
-        center, half = read("geom_aabb")[:, self._ids].expand(len(pos), -1, -1).split(3, dim=-1)
-        # MuJoCo's boxes of planes are too large for single precision.
-        center, half = center.clone(), half.clone()
-        center[:, self._planes], half[:, self._planes, 2] = 0.0, 0.0
+        # Boxes follow what environments hold, whether or not `geom_aabb` was written with it.
+        center, half = torch.zeros_like(size), size.gather(-1, self._axes.expand_as(size))
+        half[..., 2] += torch.where(self._is_capsule, size[..., 0], 0.0)
+        half[:, self._planes, 2] = 0.0
+        for columns, boxes in self._boxes:
+            exists[:, columns] = dataid[:, columns] >= 0
+            box = boxes[dataid[:, columns].long()]
+            center[:, columns], half[:, columns] = box.split(3, dim=-1)
         sides = size[:, self._planes, :2]
         half[:, self._planes, :2] = sides.masked_fill(sides <= 0.0, _ENDLESS)
         rgba, material = read("geom_rgba")[:, self._ids], read("geom_matid")[:, self._ids].long()
