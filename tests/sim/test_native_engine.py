@@ -216,6 +216,45 @@ def test_a_stage_computes_its_fields_and_leaves_those_of_later_ones(name: str, s
             assert torch.equal(staged[field], expected), field
 
 
+# Fields that are read late.
+
+READ_LATE = ("xpos", "cvel", "qfrc_bias", "qacc", "qfrc_constraint", "actuator_force", "sensordata")
+
+
+@pytest.mark.parametrize("name", READ_LATE)
+@pytest.mark.parametrize("moment", ["step", "vel", "acc of some"])
+def test_a_field_first_read_late_is_what_one_read_from_the_start_is(name: str, moment: str) -> None:
+    early, late = build(num_threads=2), build(num_threads=1)
+    _ = getattr(early.data, name), late.data.xquat
+    for sim in (early, late):
+        sim.data.qvel[:, 0] = torch.tensor([0.0, 0.5, 1.0])
+        for _ in range(12):
+            sim.step(3)
+            sim.forward(stage="vel")
+        sim.step(3)
+        if moment != "step":
+            sim.data.qpos[1, 2] += 0.1
+            sim.forward(stage="vel")
+        if moment == "acc of some":
+            sim.forward(torch.tensor([1]))
+    rows = early._engine._rows.clone()
+    assert torch.equal(getattr(late.data, name), getattr(early.data, name))
+    assert torch.equal(late._engine._rows, rows)
+    for sim in (early, late):
+        sim.step(3)
+    assert torch.equal(late.data.qpos, early.data.qpos)
+
+
+@pytest.mark.parametrize("write", ["numpy", "data"])
+def test_model_fields_written_behind_torch_act_in_the_next_step(write: str) -> None:
+    sim = build()
+    sim.expand_model_fields(("gravity",))
+    values = sim.model.gravity.numpy() if write == "numpy" else sim.model.gravity.data
+    values[:] = 0.0
+    sim.step(5)
+    assert not sim.data.qvel.any()
+
+
 # Sleep.
 
 
@@ -245,6 +284,9 @@ def test_a_model_with_sleep_steps_as_plain_mujoco_does() -> None:
     mujoco.mj_step(sim.mj_model, host, 20)
     assert np.array_equal(sim.copy_to_host(1).qpos, host.qpos)
     assert torch.equal(sim.data.qpos[[0, 2]], asleep[[0, 2]])
+    # Which trees are asleep is not in the state rows.
+    with pytest.raises(ValueError, match="sleep"):
+        sim.load_state_dict(sim.state_dict())
 
 
 # Exact resume.

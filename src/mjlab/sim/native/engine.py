@@ -47,7 +47,11 @@ logger = logging.getLogger(__name__)
 # State that a step changes by itself; the rest changes only by being written.
 _ADVANCED = frozenset({"time", "qpos", "qvel", "act", "qacc_warmstart"})
 
-_DERIVED_CONSTANTS = (*FIXED_CONSTANTS, *CONSTANTS_AT_QPOS0, "dof_M0")
+_DERIVED_CONSTANTS = (
+    *FIXED_CONSTANTS,
+    *CONSTANTS_AT_QPOS0,
+    *("dof_M0", "flexedge_length0", "flexedge_invweight0"),
+)
 
 # The compiler marks frames that coincide and MuJoCo then skips their transforms, so the marks
 # have to go before such a frame is randomized.
@@ -177,7 +181,7 @@ class NativeEngine(Engine):
         current = self._has_accelerations if is_late else self._has_velocities
         if name in _STEP_FIELDS:
             current = np.zeros_like(current)
-        if not current.all():
+        if self._substeps and not current.all():
             self._batch.state[:] = self._before
             self._call(self._batch.step, nstep=self._substeps)
             self._batch.state[:] = kept
@@ -257,7 +261,7 @@ class NativeEngine(Engine):
             return recorded
         # Not `Batch.rollout`: it stops environments that warn, and single steps are as fast.
         calls = [1] * nstep if record else [nstep]
-        self._copy_in()
+        self._copy_in(thorough=True)
         self._has_velocities[:] = self._has_accelerations[:] = False
         for k, count in enumerate(calls):
             is_last = k == len(calls) - 1
@@ -319,16 +323,21 @@ class NativeEngine(Engine):
             ids = np.arange(self.num_envs) if env_ids is None else env_ids.numpy()
             return torch.from_numpy(np.setdiff1d(ids, error.ids))
 
-    def _copy_in(self) -> None:
+    def _copy_in(self, thorough: bool = False) -> None:
         """Pass on what was written into state and model fields since the last call."""
         for field in self._inputs.values():
             field.copy_in()
-        self._copy_in_model()
+        self._copy_in_model(thorough)
 
-    def _copy_in_model(self) -> None:
+    def _copy_in_model(self, thorough: bool = False) -> None:
+        """Pass on what was written into model fields.
+
+        They are large and seldom written, so only a `thorough` look, once a step, sees what torch
+        does not count: writes through numpy or `.data`.
+        """
         moved = None
         for name, field in self._model_copies.items():
-            written = field.copy_in()
+            written = field.copy_in() if thorough or field.is_versioned() else None
             if written is not None and name in _BOUNDED:
                 rows = written.flatten(1).any(dim=1)
                 moved = rows if moved is None else moved | rows
@@ -346,7 +355,8 @@ class NativeEngine(Engine):
         for name in self._model_copies.keys() & _BOUNDED:
             self._bounds.expand(name)[:] = self._batch.expand(name)
         self._call(self._bounds.set_const, env_ids)
-        for name in _BOUNDING_VOLUMES:
+        # Bounding spheres, which the rays of MuJoCo 4 mind, unless they are written by others.
+        for name in {*_BOUNDING_VOLUMES, "geom_rbound"} - self._model_tensors.keys():
             self._batch.expand(name)[:] = self._bounds.expand(name)
 
     def constants_written_by(self, level: int) -> tuple[str, ...]:
@@ -357,7 +367,7 @@ class NativeEngine(Engine):
     def recompute_constants(self, level: int, env_ids: torch.Tensor | None) -> None:
         # mj_setConst does both parts at once; the part not asked for comes out as it was.
         self.expand(self.constants_written_by(level))
-        self._copy_in()
+        self._copy_in(thorough=True)
         self._call(self._batch.set_const, env_ids)
         # It also marks frames that coincide, which may be moved apart afterwards.
         for mark in self._frame_marks.values():
@@ -441,7 +451,7 @@ class NativeEngine(Engine):
         self._batch.get_data(env_idx, mj_data)
 
     def state_dict(self) -> dict[str, Any]:
-        self._copy_in()
+        self._copy_in(thorough=True)
         raw = {name: field.source for name, field in self._model_copies.items()}
         return {
             "library": "mujoco.batch",
@@ -465,6 +475,11 @@ class NativeEngine(Engine):
             raise ValueError(
                 "The saved physics state is of the native engine before mujoco.batch, which cannot "
                 "be continued exactly; only weights can be used."
+            )
+        if self._batch.persistent:
+            raise ValueError(
+                "A model with sleep: which trees are asleep is not saved, so a run cannot continue "
+                "exactly; only weights can be used."
             )
         if state["state"].shape != self._rows.shape:
             raise ValueError(
@@ -507,13 +522,14 @@ class _Copy:
         self, rows: torch.Tensor | None = None, columns: torch.Tensor | None = None
     ) -> None:
         """Copy the source out: all of it, or `rows`, or `columns` (a mask) of a matrix."""
-        kept = None if columns is None else self.values.clone()
-        if rows is None:
+        if columns is not None:
+            kept = self.values.clone()
+            self.copy_out(rows)
+            torch.where(columns, self.values, kept, out=self.values)
+        elif rows is None:
             self.values.copy_(self.source)
         else:
             self.values[rows] = self.source[rows].to(self.values.dtype)
-        if kept is not None:
-            torch.where(columns, self.values, kept, out=self.values)
 
 
 class _Input(_Copy):
@@ -526,9 +542,15 @@ class _Input(_Copy):
         super().__init__(source, dtype)
         with torch.inference_mode(False):
             self._seen = self.values.clone()
+        self._version = self.values._version
+
+    def is_versioned(self) -> bool:
+        """Return True if torch counted a write since the last copy."""
+        return self.values._version != self._version
 
     def copy_in(self) -> torch.Tensor | None:
         """Copy elements that were written into the source; return a mask of them, None if none."""
+        self._version = self.values._version
         if torch.equal(self.values, self._seen):
             return None
         written = self.values != self._seen
@@ -536,10 +558,13 @@ class _Input(_Copy):
         self._seen.copy_(self.values)
         return written
 
-    def copy_out(self, rows: torch.Tensor | None = None) -> None:
-        super().copy_out(rows)
+    def copy_out(
+        self, rows: torch.Tensor | None = None, columns: torch.Tensor | None = None
+    ) -> None:
+        super().copy_out(rows, columns)
         index = slice(None) if rows is None else rows
         self._seen[index] = self.values[index]
+        self._version = self.values._version
 
 
 def _seam_type(source: torch.Tensor) -> torch.dtype:
