@@ -169,13 +169,47 @@ def test_forces_are_those_of_the_entity_and_its_selected_actuators():
     env.close()
 
 
-def test_controls_of_an_unlisted_actuator_are_written_by_their_place_in_the_entity():
+@pytest.mark.parametrize(
+    ("names", "columns"),
+    [(("turn",), [0, 1, 2]), (("ankle",), [5]), (("hip", "ankle"), [3, 4, 5]), ((".*",), range(7))],
+)
+@pytest.mark.parametrize("as_ids", [list, torch.tensor, "mask", "slice"])
+def test_controls_are_written_to_the_actuators_that_are_found(names, columns, as_ids):
     env = make_env(ARM.format(actuators=TURN + PID + SERVO))
     env.reset()
     robot = env.scene["robot"]
-    robot.write_ctrl_to_sim(torch.tensor([[0.1, 0.2, 0.3]]), ctrl_ids=[0, 1, 2])
-    assert torch.allclose(env.sim.data.ctrl[:, :3], torch.tensor([0.1, 0.2, 0.3]))
+    ids, _ = robot.find_actuators(names)
+    if as_ids == "mask":
+        chosen = torch.isin(torch.arange(4), torch.tensor(ids))
+    else:
+        chosen = slice(ids[0], ids[-1] + 1) if as_ids == "slice" else as_ids(ids)
+    before = env.sim.data.ctrl.clone()
+    values = torch.arange(1.0, len(columns) + 1)
+    robot.write_ctrl_to_sim(values.repeat(NUM_ENVS, 1), ctrl_ids=chosen)
+    before[:, list(columns)] = values
+    assert torch.equal(env.sim.data.ctrl, before)
     assert robot.indexing.ctrl_ids.tolist() == list(range(7))
+    env.close()
+
+
+def test_controls_of_another_width_than_the_actuators_have_raise():
+    env = make_env(ARM.format(actuators=TURN + PID + SERVO))
+    robot = env.scene["robot"]
+    with pytest.raises(ValueError, match="2 values .* 3 are"):
+        robot.write_ctrl_to_sim(torch.zeros(NUM_ENVS, 2), ctrl_ids=[0])
+    with pytest.raises(IndexError):
+        robot.write_ctrl_to_sim(torch.zeros(NUM_ENVS, 1), ctrl_ids=[4])
+    env.close()
+
+
+def test_ids_of_an_actuator_object_are_those_of_its_elements_in_the_entity():
+    env = make_env(ARM.format(actuators=TURN + PID + SERVO))
+    robot = env.scene["robot"]
+    for actuator, names in zip(robot.actuators, (["hip"], ["ankle"], ["knee"]), strict=True):
+        assert actuator.ctrl_ids.tolist() == robot.find_actuators(names)[0]
+    hip = robot.actuators[0]
+    robot.write_ctrl_to_sim(torch.tensor([[1.0, 2.0]]), ctrl_ids=hip.ctrl_ids)
+    assert env.sim.data.ctrl[:, hip.global_ctrl_ids].tolist() == [[1.0, 2.0]] * NUM_ENVS
     env.close()
 
 

@@ -182,7 +182,12 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
 
     @property
     def ctrl_ids(self) -> torch.Tensor:
-        """(number of controls,) int64 indices within the entity's controls."""
+        """(number of elements,) int64 ids of the elements in the entity, as `find_actuators` counts.
+
+        `EntityData.write_ctrl` takes them, with the controls of each element in turn. `compute`
+        gives controls in the order of `global_ctrl_ids`; both orders agree for elements with one
+        control.
+        """
         return self._initialized(self._ctrl_ids)
 
     @property
@@ -238,7 +243,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
                 "model is compiled."
             )
         # Actuators without a name can only be found by their place in the spec.
-        own = control_columns(mj_model, (actuator.id for actuator in self.entity.spec.actuators))
+        own = [actuator.id for actuator in self.entity.spec.actuators]
         element_ids = [actuator.id for actuator in elements]
         by_element = [control_columns(mj_model, (i,)) for i in element_ids]
         columns = [
@@ -250,7 +255,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         self._target_ids = _int_tensor(self._target_ids_list, device)
         self._global_element_ids = _int_tensor(element_ids, device)
         self._global_ctrl_ids = _int_tensor(columns, device)
-        self._ctrl_ids = _int_tensor([own.index(column) for column in columns], device)
+        self._ctrl_ids = _int_tensor([own.index(i) for i in element_ids], device)
         self._in_group, self._resets_delay, self._delay_buffer = False, True, None
         if self.has_delay:
             self._delay_buffer = self.make_delay_buffer(data.nworld, device)

@@ -147,7 +147,10 @@ class EntityCommands:
     def write_ctrl_to_sim(
         self, ctrl: torch.Tensor, ctrl_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Write controls (k, number of controls)."""
+        """Write controls (k, number of controls) of actuators `ctrl_ids`, as `find_actuators` counts.
+
+        See `EntityData.write_ctrl` for actuators with several controls.
+        """
         self.data.write_ctrl(ctrl, ctrl_ids, env_ids)
 
     def write_mocap_pose_to_sim(self, mocap_pose: torch.Tensor, env_ids: EnvIds = None) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import mujoco
 import torch
@@ -14,6 +14,8 @@ from mjlab.utils.mujoco import control_columns, dof_width, force_columns, qpos_w
 
 Ids: TypeAlias = torch.Tensor | slice | Sequence[int] | None
 """A selection: None for all, a slice, or whole numbers (list, tensor) or a boolean mask."""
+
+IdsT = TypeVar("IdsT", bound="Ids | int")
 
 
 class Addresses:
@@ -112,22 +114,13 @@ class EntityIndexing:
     moved_bodies: torch.Tensor
     """(nj, number of bodies) float32, 1 where a degree of freedom of `joint_v_adr` moves a body."""
 
-    def force_columns(
-        self, actuator_ids: Sequence[int] | torch.Tensor | slice | int
-    ) -> Sequence[int] | torch.Tensor | slice | int:
+    def force_columns(self, actuator_ids: IdsT) -> IdsT | list[int]:
         """Return the columns of `EntityData.actuator_force` of some of the entity's actuators."""
-        forces = self._forces
-        if all(len(own) == 1 for own in forces):
-            return actuator_ids
-        if isinstance(actuator_ids, torch.Tensor):
-            mask = actuator_ids.dtype == torch.bool
-            actuator_ids = (actuator_ids.nonzero().flatten() if mask else actuator_ids).tolist()
-        if isinstance(actuator_ids, slice):
-            chosen = forces[actuator_ids]
-        else:
-            ids = (actuator_ids,) if isinstance(actuator_ids, int) else actuator_ids
-            chosen = tuple(forces[i] for i in ids)
-        return [column for own in chosen for column in own]
+        return _columns_of(self._forces, actuator_ids)
+
+    def control_columns(self, actuator_ids: IdsT) -> IdsT | list[int]:
+        """Return the positions in `ctrl_ids` of the controls of some of the entity's actuators."""
+        return _columns_of(self._controls, actuator_ids)
 
     @property
     def root_body_id(self) -> int:
@@ -137,6 +130,23 @@ class EntityIndexing:
     _root_id: int = -1
     _forces: tuple[range, ...] = ()
     """For each of `actuators`, its columns among `force_ids`."""
+    _controls: tuple[range, ...] = ()
+    """For each of `actuators`, its columns among `ctrl_ids`."""
+
+
+def _columns_of(own: tuple[range, ...], actuator_ids: IdsT) -> IdsT | list[int]:
+    """Return the columns of actuators that own some each; the ids themselves if each owns one."""
+    if actuator_ids is None or all(len(columns) == 1 for columns in own):
+        return actuator_ids
+    if isinstance(actuator_ids, torch.Tensor):
+        ids = torch.arange(len(own))[actuator_ids.cpu()].tolist()
+    elif isinstance(actuator_ids, slice):
+        ids = range(len(own))[actuator_ids]
+    elif isinstance(actuator_ids, int):
+        ids = (actuator_ids,)
+    else:
+        ids = actuator_ids
+    return [column for i in ids for column in own[i]]
 
 
 def build_indexing(
@@ -163,8 +173,6 @@ def build_indexing(
     actuators = elements.pop("actuators")
     ids = {kind: element_ids(model, kind, found) for kind, found in elements.items()}
     actuator_ids = element_ids(model, "actuators", actuators) if is_actuated else []
-    widths = [int(model.actuator_outnum[i]) for i in actuator_ids]
-    stops = tuple(itertools.accumulate(widths))
     joints = [(int(model.jnt_type[i]), i) for i in ids["joints"]]
     dofs = [model.jnt_dofadr[i] + k for kind, i in joints for k in range(dof_width(kind))]
     free = [] if free_joint is None else element_ids(model, "joints", (free_joint,))
@@ -202,7 +210,15 @@ def build_indexing(
         site_tree_ids=tensor(model.body_rootid[i] for i in site_bodies),
         moved_bodies=_moved_bodies(model, dofs, ids["bodies"]).to(device),
         _root_id=root,
-        _forces=tuple(range(stop - n, stop) for stop, n in zip(stops, widths, strict=True)),
+        _forces=_ranges(int(model.actuator_outnum[i]) for i in actuator_ids),
+        _controls=_ranges(int(model.actuator_ctrlnum[i]) for i in actuator_ids),
+    )
+
+
+def _ranges(widths: Iterable[int]) -> tuple[range, ...]:
+    """Return ranges of these widths that follow each other from 0."""
+    return tuple(
+        range(a, b) for a, b in itertools.pairwise(itertools.accumulate(widths, initial=0))
     )
 
 

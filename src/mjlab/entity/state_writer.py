@@ -38,9 +38,9 @@ def rows(field: torch.Tensor, env_ids: EnvIds) -> torch.Tensor:
 
 
 def as_values(
-    value: Any, width: int, what: str, device: str, broadcasts: bool = False
+    value: Any, width: int, name: str, device: str, broadcasts: bool = False
 ) -> torch.Tensor:
-    """Return a tensor, array or number as float32, whose last dimension has to be `width`.
+    """Return a tensor, array or number as float32, whose last dimension must be `width`.
 
     With `broadcasts` it may be 1: one value for all elements.
 
@@ -55,7 +55,7 @@ def as_values(
     widths = (1, width) if broadcasts else (width,)
     if value.ndim > 0 and value.shape[-1] not in widths:
         raise ValueError(
-            f"{what} has {value.shape[-1]} values per environment (shape {tuple(value.shape)}), "
+            f"{name} has {value.shape[-1]} values per environment (shape {tuple(value.shape)}), "
             f"but {width} are to be written. Give a tensor of shape (number of envs, {width})."
         )
     return value
@@ -210,10 +210,10 @@ class StateWriter:
                 assign(wrench[..., half], values, env_ids, columns)
 
     def write_ctrl(self, ctrl: torch.Tensor, ctrl_ids: Ids = None, env_ids: EnvIds = None) -> None:
-        """Write controls, (k, number of controls); `ctrl_ids` count within the entity.
+        """Write controls of actuators, (k, number of controls), or (k, 1) for all alike.
 
-        Every actuator of the entity has its controls in turn: most have one, `<pid>`, `<dcmotor>`
-        and `<orientation>` may have several.
+        `ctrl_ids` are ids of actuators as `find_actuators` returns them. Controls follow each other
+        by actuator: most have one, `<pid>`, `<dcmotor>` and `<orientation>` may have several.
 
         Raises:
             ValueError: the entity has no configured actuators, or the width is wrong.
@@ -223,7 +223,7 @@ class StateWriter:
                 "write_ctrl: this entity has no actuators. List them in "
                 "EntityCfg.articulation.actuators."
             )
-        columns, width = self._ctrl.select(ctrl_ids)
+        columns, width = self._ctrl.select(self.indexing.control_columns(ctrl_ids))
         ctrl = as_values(ctrl, width, "The control", self.device, broadcasts=True)
         assign(self.data.ctrl, ctrl, env_ids, columns)
 
