@@ -279,18 +279,18 @@ class WarpEngine(Engine):
     def create_graph(self) -> None:
         """Drop captured graphs. On CUDA capture those of `step` and `forward` at once.
 
-        Elsewhere, and after `expand`, they are captured when next needed.
+        Elsewhere, and after `expand`, they are captured when next needed. State and results keep
+        their values. Overflow during warm-up is not reported.
         """
         self._graphs.clear()
         if not self._on_cuda:
             return
-        with _keeping([(self.data_field(name), None) for name in _STATE_FIELDS]):
+        data = self.wp_data
+        arrays = [a for part in (data, data.contact, data.efc) for a in vars(part).values()]
+        with _keeping([(as_torch(a), None) for a in arrays if isinstance(a, wp.array)]):
             self.launch("step", self._substep)
             for stage in _STAGES:
                 self.launch(stage, lambda stage=stage: self._forward(stage))
-        self.forward(None)
-        # What overflowed then is no fault of the user's.
-        as_torch(self.wp_data.overflow).zero_()
 
     # Fields.
 
