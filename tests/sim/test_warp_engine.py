@@ -7,13 +7,19 @@ import logging
 import subprocess
 import sys
 from contextlib import contextmanager
+from typing import Any
 
 import mujoco
+import mujoco_warp
 import pytest
 import torch
 import warp as wp
 from torch.overrides import TorchFunctionMode
 
+from mjlab.entity import EntityCfg
+from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg, mdp
+from mjlab.managers import EventTermCfg, SceneEntityCfg
+from mjlab.scene import SceneCfg
 from mjlab.sim.config import MujocoCfg, SimulationCfg
 from mjlab.sim.engine import Engine, EngineUnavailableError
 from mjlab.sim.randomization import expand_model_fields
@@ -661,6 +667,58 @@ def test_graphs_are_captured_at_construction_without_a_trace(
     engine.step(2)
     engine.check_overflow()
     assert not caplog.records
+
+
+def test_capturing_again_in_a_run_keeps_state_results_and_overflow_flags(
+    as_on_cuda: None, caplog: pytest.LogCaptureFixture
+) -> None:
+    engine = on_the_floor(make_engine(LANDING_BOX))
+    fields = ("time", "qpos", "qvel", "qacc_warmstart", "qacc", "qfrc_constraint", "sensordata")
+    engine.data_field("qvel")[0, 0] = 1.0
+    engine.step(3)
+    engine.wp_data.overflow.fill_(int(mujoco_warp.OverflowType.HFIELD))
+    before = {name: engine.data_field(name).clone() for name in (*fields, "xpos", "cvel")}
+    contacts = {name: value.clone() for name, value in vars(engine.data_field("contact")).items()}
+    engine.create_graph()
+    for name, value in before.items():
+        assert torch.equal(engine.data_field(name), value), name
+    for name, value in contacts.items():
+        assert torch.equal(getattr(engine.data_field("contact"), name), value), name
+    caplog.clear()
+    engine.check_overflow()
+    assert "height-field cells" in caplog.text
+    # A forward would compute others.
+    engine.forward(None)
+    assert not torch.equal(engine.data_field("qacc"), before["qacc"])
+
+
+@pytest.mark.parametrize("mode", ["startup", "reset"])
+def test_graphs_of_an_environment_that_randomizes_are_captured_before_its_first_reset(
+    as_on_cuda: None, monkeypatch: pytest.MonkeyPatch, mode: Any
+) -> None:
+    captures: list[int] = []
+    capture = WarpEngine._capture
+    monkeypatch.setattr(
+        WarpEngine, "_capture", lambda self, work: (captures.append(1), capture(self, work))[1]
+    )
+    robot = EntityCfg(spec_fn=lambda: mujoco.MjSpec.from_string(LANDING_BOX))
+    params = {"ranges": (0.5, 2.0), "asset_cfg": SceneEntityCfg("robot", body_names=(".*",))}
+    cfg = ManagerBasedRlEnvCfg(
+        decimation=2,
+        scene=SceneCfg(num_envs=2, entities={"robot": robot}),
+        observations={},
+        actions={},
+        events={"mass": EventTermCfg(func=mdp.dr.body_mass, mode=mode, params=params)},
+        sim=SimulationCfg(engine="warp"),
+    )
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    assert env.sim.expanded_fields
+    captured = len(captures)
+    env.reset()
+    for _ in range(2):
+        env.step(torch.zeros(2, 0))
+    assert len(captures) == captured
+    env.close()
 
 
 def test_kernels_are_loaded_before_a_capture_which_no_collection_disturbs(

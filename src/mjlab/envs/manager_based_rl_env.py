@@ -99,6 +99,8 @@ class ManagerBasedRlEnv:
             self._renderer = self._create_renderer()
         self.metadata["render_fps"] = 1.0 / self.step_dt
         self.load_managers()
+        # Expanding model fields dropped the graphs that the simulation was built with.
+        self.sim.create_graph()
         self.setup_manager_visualizers()
         self.sensor_visualizers = SensorSwitches(self.scene.sensors)
 
@@ -171,6 +173,7 @@ class ManagerBasedRlEnv:
         # anything keeps a reference to them.
         self.event_manager = EventManager(cfg.events, self)
         self.sim.expand_model_fields(self.event_manager.domain_randomization_fields)
+        self.sim.expand_constants(self.event_manager.recompute_level)
         self.command_manager = (
             CommandManager(cfg.commands, self) if cfg.commands else NullCommandManager()
         )

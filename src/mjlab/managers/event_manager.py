@@ -98,6 +98,11 @@ class EventManager(TermFunctionSwitches, TermListManager):
         )
         return tuple(dict.fromkeys(fields))
 
+    @property
+    def recompute_level(self) -> RecomputeLevel:
+        """Level that recomputes what any of the events changes."""
+        return join_levels(declared_recompute(cfg.func, cfg.params) for cfg in self._term_cfgs)
+
     def apply(
         self,
         mode: EventMode,

@@ -364,6 +364,11 @@ class Simulation:
         self.model.forget(new)
         self._options.forget(new)
 
+    def expand_constants(self, level: RecomputeLevel | int) -> None:
+        """Expand the model fields that `recompute_constants(level)` writes."""
+        if int(level) != 0:
+            self.expand_model_fields(self._engine.constants_written_by(int(level)))
+
     def recompute_constants(self, level: RecomputeLevel | int, env_ids: EnvIds = None) -> None:
         """Recompute what derives from changed model fields, as `mj_setConst` does.
 
@@ -372,7 +377,7 @@ class Simulation:
         """
         if int(level) == 0:
             return
-        self.expand_model_fields(self._engine.constants_written_by(int(level)))
+        self.expand_constants(level)
         self._engine.recompute_constants(int(level), self.resolve_ids(env_ids))
 
     # Physics.
@@ -445,7 +450,11 @@ class Simulation:
         ctx.set_render_context_source(self.render_context)
 
     def create_graph(self) -> None:
-        """Capture the step anew where the engine captures one (Warp on CUDA); else nothing."""
+        """Capture graphs of `step` and `forward` again (Warp on CUDA); no effect elsewhere.
+
+        Environments call this once, at the end of their construction. State, results and overflow
+        flags keep their values.
+        """
         self._engine.create_graph()
 
     # Queries.
