@@ -380,6 +380,9 @@ def test_unknown_fields_name_close_ones():
     sim = make_sim()
     with pytest.raises(AttributeError, match=r"qpso .*did you mean 'qpos'"):
         _ = sim.data.qpso
+    for name in ("contact", "nacon"):
+        with pytest.raises(AttributeError, match=f"native .*{name}; use a contact sensor"):
+            getattr(sim.data, name)
     with pytest.raises(ValueError, match="no field 'body_masses'"):
         sim.expand_model_fields(("body_masses",))
     with pytest.raises(AttributeError, match="write into it in place"):

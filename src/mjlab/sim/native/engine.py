@@ -155,6 +155,11 @@ class NativeEngine(Engine):
 
     def data_field(self, name: str) -> torch.Tensor:
         if name not in self._tensors:
+            if name in ("contact", "nacon"):
+                raise AttributeError(
+                    f"The native engine does not offer sim.data.{name}; use a contact sensor "
+                    "(ContactSensorCfg)."
+                )
             if name not in DATA_FIELDS:
                 raise AttributeError(f"The native engine: {_reason(self._batch.bind, name)}.")
             check_sensor_fed(self._model, name)
