@@ -140,14 +140,35 @@ def test_flags_add_up_with_those_of_the_config(kit, xml, caplog):
         other=kit.cfg(kit.BOX, '><flag limit="disable" gravity="enable"/></option>'),
     )
     cfg = MujocoCfg(disableflags=("gravity",))
-    assert reports(scene, cfg, caplog) == [
+    assert reports(scene, cfg, caplog)[0] == (
         "Option disableflags is ('gravity',), from MujocoCfg; to follow the XML of 'other', "
         "set sim.mujoco.disableflags = ()"
-    ]
+    )
     sim = Simulation(1, SimulationCfg(mujoco=cfg), spec=scene.spec, device="cpu")
     for flag in ("CONTACT", "LIMIT", "GRAVITY"):
         assert sim.mj_model.opt.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}")
     assert sim.mj_model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY
+
+
+def test_flags_of_an_xml_are_reported_as_applying_with_the_assignment(kit, xml, caplog):
+    scene = build(
+        robot=kit.cfg(xml, '><flag contact="disable" energy="enable"/></option>'),
+        other=kit.cfg(kit.BOX, '><flag contact="disable" gravity="disable"/></option>'),
+        plain=kit.cfg(kit.BOX, '><flag gravity="disable"/></option>'),
+    )
+    sim = SimulationCfg(mujoco=MujocoCfg(disableflags=("gravity",)))
+    lines = reports(scene, sim.mujoco, caplog)
+    assert lines == [
+        "Option disableflags is ('gravity',), from MujocoCfg, plus ('contact',), from the XML of "
+        "'robot' and the XML of 'other', which applies to the whole scene; to state it in the "
+        "config, set sim.mujoco.disableflags = ('gravity', 'contact')",
+        "Option enableflags is (), from MujocoCfg, plus ('energy',), from the XML of 'robot', "
+        "which applies to the whole scene; to state it in the config, "
+        "set sim.mujoco.enableflags = ('energy',)",
+    ]
+    for line in lines:
+        exec(line.partition(", set ")[2], {"sim": sim})
+    assert reports(scene, sim.mujoco, caplog) == []
 
 
 def test_entities_that_disagree_beyond_the_config_are_reported_and_neither_wins(kit):
@@ -165,7 +186,7 @@ def test_entities_that_disagree_beyond_the_config_are_reported_and_neither_wins(
     assert scene.compile().opt.viscosity == 0.0
 
 
-def test_entities_that_disagree_about_a_flag_keep_their_other_flags(kit):
+def test_entities_that_disagree_about_a_flag_keep_their_other_flags(kit, caplog):
     with pytest.warns(UserWarning, match="not applied") as caught:
         scene = build(
             one=kit.cfg(kit.BOX, '><flag contact="disable" limit="disable"/></option>'),
@@ -176,6 +197,8 @@ def test_entities_that_disagree_about_a_flag_keep_their_other_flags(kit):
     assert "two sets [] and clears ['contact']" in text
     flags = scene.compile().opt.disableflags
     assert flags == mujoco.mjtDisableBit.mjDSBL_LIMIT
+    (line,) = reports(scene, MujocoCfg(), caplog)
+    assert "plus ('limit',), from the XML of 'one'" in line
 
 
 def test_the_scenes_own_edits_win_and_are_reported(kit):

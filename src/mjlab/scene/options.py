@@ -126,12 +126,17 @@ def drop_overridden(option: Any, requests: dict[str, OptionRequest]) -> dict[str
     return kept
 
 
-def report_overruled(cfg: MujocoCfg, stated: dict[str, EntityOptions]) -> None:
+def report_overruled(
+    cfg: MujocoCfg, stated: dict[str, EntityOptions], requests: dict[str, OptionRequest]
+) -> None:
     """Log what `cfg` decides otherwise than XMLs state, one line each with the assignment to copy.
+
+    Flags that XMLs set in addition to those of `cfg` apply, and are logged too.
 
     Args:
         cfg: The options that are in force.
         stated: Options by where they are stated, such as "the XML of 'robot'".
+        requests: Options of entities that are applied to the scene.
     """
     for source, options in stated.items():
         for name, value in options.values.items():
@@ -143,6 +148,19 @@ def report_overruled(cfg: MujocoCfg, stated: dict[str, EntityOptions]) -> None:
             kept = tuple(flag for flag in current if flag not in cleared)
             if kept != current:
                 _report(source, name, current, kept)
+    for name in (name for name in _FLAG_ENUMS if name in requests):
+        current = tuple(getattr(cfg, name))
+        added = tuple(flag for flag in _flags(name, requests[name].value) if flag not in current)
+        if added:
+            sources = [f"the XML of {entity!r}" for entity in requests[name].entities]
+            adding = [
+                s for s in sources if set(_flags(name, stated[s].switches[name][0])) & set(added)
+            ]
+            logger.warning(
+                "Option %s is %r, from MujocoCfg, plus %r, from %s, which applies to the whole "
+                "scene; to state it in the config, set sim.mujoco.%s = %r",
+                name, current, added, " and ".join(adding), name, current + added,
+            )  # fmt: skip
 
 
 def _report(source: str, name: str, current: Any, wanted: Any) -> None:

@@ -259,12 +259,13 @@ class Scene:
         """Log the options that `cfg` decides otherwise than the XML of an entity, or `spec_fn`.
 
         `MujocoCfg` decides every option that it has; the others are on `spec.option` since the
-        scene was built, as the XML asks, and so are flags, to which those of `cfg` are added.
+        scene was built, as the XML asks, and so are flags, to which those of `cfg` are added. Flags
+        of an XML that `cfg` lacks are logged too.
         """
         stated = {f"the XML of {name!r}": e.options for name, e in self._entities.items()}
         if self._cfg.spec_fn is not None:
             stated["SceneCfg.spec_fn"] = stated_options(self._spec)
-        report_overruled(cfg, stated)
+        report_overruled(cfg, stated, self.entity_options)
 
     # Life cycle.
 

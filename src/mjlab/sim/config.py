@@ -52,9 +52,11 @@ class MujocoCfg:
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     """Gravitational acceleration in the world frame, in m/s^2."""
     disableflags: tuple[str, ...] = ()
-    """MuJoCo features to disable, by lower-case flag name, such as `contact`."""
+    """MuJoCo features to disable, by lower-case flag name, such as `contact`. Flags that the XML of
+    an entity sets are added."""
     enableflags: tuple[str, ...] = ()
-    """MuJoCo features to enable, by lower-case flag name, such as `energy`."""
+    """MuJoCo features to enable, by lower-case flag name, such as `energy`. Flags that the XML of
+    an entity sets are added."""
 
     def apply(self, model: mujoco.MjModel) -> None:
         """Write these options onto `model`; flags are added to those already set.
