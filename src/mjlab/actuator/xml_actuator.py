@@ -31,8 +31,8 @@ class XmlActuatorCfg(ActuatorCfg):
     """Take over actuators of the XML, see `XmlActuator`."""
 
     command_field: CommandField | None = None
-    """What the controls are: position, velocity or effort. None detects it from each actuator, and
-    is required for actuators with several controls."""
+    """Target that the control reads: position, velocity or effort. None: detected from each
+    actuator; actuators with several controls need None."""
 
     def validate(self) -> None:
         """See `ActuatorCfg`."""
