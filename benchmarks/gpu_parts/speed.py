@@ -54,7 +54,7 @@ class BareWarp:
             sim.cfg.apply_wp_opt(self._model.opt)
             self._data = mjw.put_data(
                 sim.mj_model,
-                engine._placed(sim.mj_model, sim.cfg),
+                engine._host,
                 env.num_envs,
                 nconmax=sim.wp_data.naconmax // env.num_envs,
                 njmax=sim.wp_data.njmax,
