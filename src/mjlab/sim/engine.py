@@ -407,8 +407,14 @@ def create_engine(
     """Build the engine called `name` (a result of `resolve_engine_name`).
 
     Raises:
-        EngineUnavailableError: it cannot run on this machine.
+        EngineUnavailableError: its package is missing, or it cannot run on this machine.
     """
     module_name, class_name = _ENGINES[name]
-    module = importlib.import_module(module_name)
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise EngineUnavailableError(
+            f"The {name} engine cannot be loaded: {error}. Install the missing package, or use "
+            f"--engine {'warp' if name == 'native' else 'native'}."
+        ) from error
     return getattr(module, class_name)(model, num_envs, cfg, device)
