@@ -40,10 +40,12 @@ RESULTS_ZERO_ON_RESET = frozenset({"qacc", "act_dot", "sensordata"})
 VELOCITY_FIELDS = frozenset(
     {"cvel", "cdof_dot", "actuator_velocity", "ten_velocity", "flexedge_velocity", "energy"}
     | {"qfrc_bias", "qfrc_passive", "qfrc_spring", "qfrc_damper", "qfrc_gravcomp", "qfrc_fluid"}
-    | {"qfrc_adhesion", "subtree_linvel", "subtree_angmom"}
+    | {"subtree_linvel", "subtree_angmom"}
 )
 ACCELERATION_FIELDS = frozenset(
-    {"qacc", "qacc_smooth", "qfrc_smooth", "qfrc_constraint", "qfrc_actuator", "qfrc_inverse"}
+    # Counts of contacts and constraints, and what depends on them, belong to the forces.
+    {"ncon", "ne", "nf", "nl", "nefc", "nJ", "nA", "nisland", "nidof", "qfrc_adhesion"}
+    | {"qacc", "qacc_smooth", "qfrc_smooth", "qfrc_constraint", "qfrc_actuator", "qfrc_inverse"}
     | {"actuator_force", "act_dot", "cacc", "cfrc_int", "cfrc_ext"}
     | {"solver", "solver_niter", "solver_nnz", "solver_fwdinv"}
 )
@@ -272,7 +274,7 @@ class Engine(ABC):
     def forward(self, env_ids: torch.Tensor | None, stage: Stage = "acc") -> None:
         """Make derived fields up to a stage current with the state, without advancing time.
 
-        `"pos"`: positions and contacts. `"vel"`: velocities too. `"acc"`: everything. Fields and
+        `"pos"`: positions. `"vel"`: velocities too. `"acc"`: everything. Fields and
         sensors of later stages keep their values.
         """
 

@@ -399,7 +399,7 @@ class Simulation:
     def forward(self, env_ids: EnvIds = None, stage: Stage = "acc") -> None:
         """Make derived fields up to a stage current with the state, without advancing time.
 
-        `"pos"`: positions and contacts. `"vel"`: velocities too. `"acc"`: everything. Fields and
+        `"pos"`: positions. `"vel"`: velocities too. `"acc"`: everything. Fields and
         sensors of later stages keep their values.
         """
         self._engine.forward(self.resolve_ids(env_ids), stage)
