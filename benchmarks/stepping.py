@@ -6,11 +6,10 @@ earlier commit, say, with its own `.venv`), taking turns. `growth.py` compares n
 
 from __future__ import annotations
 
+import functools
 import json
-import statistics
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -44,11 +43,11 @@ class Stepper:
             raise RuntimeError(f"{' '.join(self._process.args)} ended; its error stands above.")
         return json.loads(line)
 
-    def time(self, steps: int) -> float:
-        """Step so often; return the seconds of one step."""
-        self._process.stdin.write(f"{steps}\n")
+    def step(self, count: int) -> None:
+        """Step so often."""
+        self._process.stdin.write(f"{count}\n")
         self._process.stdin.flush()
-        return self._answer()["seconds"]
+        self._answer()
 
     def close(self) -> None:
         """End the process."""
@@ -61,14 +60,16 @@ def median_times(steppers: list[Stepper], samples: int, repeats: int = 15) -> li
 
     Each turn makes about `samples` steps of single environments.
     """
-    times: list[list[float]] = [[] for _ in steppers]
-    turns = list(zip(steppers, times, strict=True))
-    for _ in range(repeats):
-        # In the other order next time: whoever comes second finds other things in the caches.
-        turns.reverse()
-        for stepper, taken in turns:
-            taken.append(stepper.time(max(1, samples // stepper.num_envs)))
-    return [statistics.median(taken) for taken in times]
+    # Here, because an earlier checkout serves this file without MuJoCo's batch engine.
+    from timing import alternate
+
+    counts = [max(1, samples // stepper.num_envs) for stepper in steppers]
+    turns = [
+        functools.partial(stepper.step, count)
+        for stepper, count in zip(steppers, counts, strict=True)
+    ]
+    times = alternate(*turns, steps=1, repeats=repeats, warm_up=0)
+    return [seconds / count for seconds, count in zip(times, counts, strict=True)]
 
 
 def _resident_bytes() -> int:
@@ -98,11 +99,9 @@ def _serve(task: str, num_envs: int) -> None:
         env.step(actions)
     print(json.dumps({"bytes": _resident_bytes() - before}), flush=True)
     for line in sys.stdin:
-        begin = time.perf_counter()
         for _ in range(int(line)):
             env.step(actions)
-        seconds = (time.perf_counter() - begin) / int(line)
-        print(json.dumps({"seconds": seconds}), flush=True)
+        print(json.dumps({"steps": int(line)}), flush=True)
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ def alternate(
     turns = list(zip(samples, times, strict=True))
     for _ in range(repeats):
         before()
-        # In the other order next time: whoever comes second finds other things in the caches.
+        # Reverse the order: the caches favor one position.
         turns.reverse()
         for sample, taken in turns:
             wait()

@@ -35,7 +35,7 @@ def rollout(task: str, engine: Any, dtype: torch.dtype) -> list[torch.Tensor]:
     try:
         cfg = load_env_cfg(task)
         cfg.scene.num_envs, cfg.seed, cfg.sim.engine = NUM_ENVS, 3, engine
-        ones = torch.ones  # Made anew by the terms, in the default type.
+        ones = torch.ones  # Called at every step, in the default type.
         cfg.observations["actor"].terms["own"] = ObservationTermCfg(
             func=lambda env: ones(env.num_envs, 2)
         )

@@ -1,4 +1,4 @@
-"""What a step computes anew, against plain MuJoCo: a loop over `mj_step` and `mj_forward`."""
+"""Freshness of fields after a step, against a plain loop over `mj_step` and `mj_forward`."""
 
 from __future__ import annotations
 

@@ -496,7 +496,7 @@ def test_a_ground_that_differs_is_found_by_trying_everything_and_said_once(monke
 
 @pytest.mark.parametrize("compiled", [0.0, 1.0])
 def test_a_block_is_met_where_it_is_visible(compiled):
-    """Whether it was compiled transparent or not, in the one environment in which it is not."""
+    """A geom is hit in the environment in which it is opaque, compiled transparent or not."""
     model = terrain_model()
     block = 1
     model.geom_rgba[block, 3] = compiled

@@ -10,7 +10,13 @@ from typing import Any, TypeAlias, TypeVar
 import mujoco
 import torch
 
-from mjlab.utils.mujoco import control_columns, dof_width, force_columns, qpos_width
+from mjlab.utils.mujoco import (
+    control_columns,
+    dof_width,
+    force_columns,
+    moving_dofs,
+    qpos_width,
+)
 
 Ids: TypeAlias = torch.Tensor | slice | Sequence[int] | None
 """A selection: None for all, a slice, or whole numbers (list, tensor) or a boolean mask."""
@@ -175,6 +181,7 @@ def build_indexing(
     actuator_ids = element_ids(model, "actuators", actuators) if is_actuated else []
     joints = [(int(model.jnt_type[i]), i) for i in ids["joints"]]
     dofs = [model.jnt_dofadr[i] + k for kind, i in joints for k in range(dof_width(kind))]
+    moved = moving_dofs(model)[ids["bodies"]][:, dofs].T
     free = [] if free_joint is None else element_ids(model, "joints", (free_joint,))
     geom_bodies = [int(model.geom_bodyid[i]) for i in ids["geoms"]]
     site_bodies = [int(model.site_bodyid[i]) for i in ids["sites"]]
@@ -208,7 +215,7 @@ def build_indexing(
         geom_tree_ids=tensor(model.body_rootid[i] for i in geom_bodies),
         site_body_ids=tensor(site_bodies),
         site_tree_ids=tensor(model.body_rootid[i] for i in site_bodies),
-        moved_bodies=_moved_bodies(model, dofs, ids["bodies"]).to(device),
+        moved_bodies=torch.from_numpy(moved).float().to(device),
         _root_id=root,
         _forces=_ranges(int(model.actuator_outnum[i]) for i in actuator_ids),
         _controls=_ranges(int(model.actuator_ctrlnum[i]) for i in actuator_ids),
@@ -220,18 +227,6 @@ def _ranges(widths: Iterable[int]) -> tuple[range, ...]:
     return tuple(
         range(a, b) for a, b in itertools.pairwise(itertools.accumulate(widths, initial=0))
     )
-
-
-def _moved_bodies(model: mujoco.MjModel, dofs: list[int], bodies: list[int]) -> torch.Tensor:
-    moves = torch.zeros(len(dofs), len(bodies), dtype=torch.float32)
-    for column, body in enumerate(bodies):
-        ancestors = set()
-        while body:
-            ancestors.add(body)
-            body = int(model.body_parentid[body])
-        for row, dof in enumerate(dofs):
-            moves[row, column] = int(model.dof_bodyid[dof]) in ancestors
-    return moves
 
 
 _OBJECT_TYPES = {

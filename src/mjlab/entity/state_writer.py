@@ -77,7 +77,7 @@ class StateWriter:
     of links, sensors, ...) keeps its old values until the next `sim.forward()`.
 
     Environments whose poses or joint positions were written are noted in `moved_envs`: forces of the
-    last substep do not belong to them any more, so `env.step` and `env.reset` compute these anew.
+    last substep do not belong to them any more, so `env.step` and `env.reset` recompute these.
     """
 
     indexing: EntityIndexing

@@ -233,9 +233,9 @@ class Scene:
 
     @property
     def needs_substep(self) -> bool:
-        """Whether an actuator or a sensor must be called at every physics substep.
+        """True if an actuator or a sensor acts at every physics substep.
 
-        Sensors with `recorded_fields` need not.
+        Sensors with `recorded_fields` do not.
         """
         return any(entity.needs_substep for entity in self._entities.values()) or any(
             sensor.needs_substep and not sensor.recorded_fields for sensor in self._sensors.values()

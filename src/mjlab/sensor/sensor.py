@@ -42,7 +42,7 @@ class Sensor(ABC, Generic[T]):
     """Reads something from the simulation, in all environments.
 
     `data` is computed when it is first read, and kept until time passes (`update`), the
-    environment is reset (`reset`), or `sim.forward` computes the fields that it is made of anew
+    environment is reset (`reset`), or `sim.forward` recomputes the fields that it is made of
     (the scene then calls `invalidate_cache`). So it always belongs to the same state as these
     fields of the simulation.
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Literal
 
 import mujoco
+import numpy as np
 
 CommandField = Literal["position", "velocity", "effort"]
 
@@ -132,6 +133,16 @@ def detect_command_field(actuator: mujoco.MjsActuator) -> CommandField:
             "<pid> and <dcmotor>; for another kind state the command field in the actuator config."
         )
     return inputs[0]
+
+
+def moving_dofs(model: mujoco.MjModel) -> np.ndarray:
+    """Return which degrees of freedom move which bodies, (nbody, nv) bool."""
+    moves = np.zeros((model.nbody, model.nv), dtype=bool)
+    for body in range(1, model.nbody):
+        moves[body] = moves[model.body_parentid[body]]
+        first = model.body_dofadr[body]
+        moves[body, first : first + model.body_dofnum[body]] = True
+    return moves
 
 
 def control_columns(model: mujoco.MjModel, actuator_ids: Iterable[int]) -> list[int]:

@@ -36,6 +36,7 @@ from mjlab.sim.engine import (
 from mjlab.sim.native.rays import NativeRays
 from mjlab.sim.native.render import NativeRenderer, render_problem
 from mjlab.sim.randomization import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
+from mjlab.utils.mujoco import moving_dofs
 from mjlab.utils.processes import cores_per_process
 
 if TYPE_CHECKING:
@@ -452,12 +453,7 @@ class NativeEngine(Engine):
     @functools.cached_property
     def _moving_dofs(self) -> torch.Tensor:
         """(nbody, nv) whether a body moves with a degree of freedom."""
-        moves = np.zeros((self._model.nbody, self._model.nv), dtype=np.float32)
-        for body in range(1, self._model.nbody):
-            moves[body] = moves[self._model.body_parentid[body]]
-            first = self._model.body_dofadr[body]
-            moves[body, first : first + self._model.body_dofnum[body]] = 1.0
-        return torch.from_numpy(moves)
+        return torch.from_numpy(moving_dofs(self._model)).float()
 
     # Copies.
 

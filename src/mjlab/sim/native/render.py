@@ -181,7 +181,7 @@ class Geoms:
 
 @dataclass
 class Surfaces:
-    """What n x P rays met, in the frame of the camera."""
+    """Hits of n x P rays, in the camera frame."""
 
     directions: torch.Tensor
     """Unit vectors along the rays, (3, 1 or n, P)."""
@@ -538,7 +538,7 @@ class _Slots:
         # In double precision, as the batch wants them.
         self._origins, self._directions = np.zeros((rows, rays, 3)), np.zeros((rows, rays, 3))
         self.hits = Hits.empty(rows, rays)
-        """What the rays met; its geoms are slots."""
+        """Hits of the rays; geom ids are slots."""
 
     def load(self, geoms: Geoms, in_sight: torch.Tensor) -> None:
         """Put into each row the geoms that are in its sight: (rows, G) bool, rows by environment.

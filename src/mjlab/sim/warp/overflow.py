@@ -26,7 +26,7 @@ _CHECK_PERIOD = 64
 SIZES = ("njmax", "nconmax", "contact_sensor_maxmatch")
 """Options of `SimulationCfg` that say how much memory there is."""
 
-# By name of an `OverflowType`: the option to raise, and what there is more of. Reaching an iteration
+# By name of an `OverflowType`: the option to raise, and the quantity that exceeded it. Reaching an iteration
 # limit of the solver is left out: native MuJoCo does not report it either.
 _OUTGROWN = {
     "NEFC": ("njmax", "constraint rows"),
