@@ -95,12 +95,14 @@ def _serve(task: str, num_envs: int) -> None:
     generator = torch.Generator().manual_seed(0)
     shape = (num_envs, env.action_manager.total_action_dim)
     actions = ACTION_SIZE * torch.randn(shape, generator=generator)
+    # As training steps.
+    step = torch.inference_mode()(env.step)
     for _ in range(STEPS_BEFORE):
-        env.step(actions)
+        step(actions)
     print(json.dumps({"bytes": _resident_bytes() - before}), flush=True)
     for line in sys.stdin:
         for _ in range(int(line)):
-            env.step(actions)
+            step(actions)
         print(json.dumps({"steps": int(line)}), flush=True)
 
 

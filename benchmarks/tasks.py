@@ -75,8 +75,9 @@ def measure_case(case: Case) -> Row:
     generator = torch.Generator().manual_seed(0)
     shape = (case.num_envs, env.action_manager.total_action_dim)
     actions = ACTION_SIZE * torch.randn(shape, generator=generator)
+    step = torch.inference_mode()(env.step)
     for _ in range(STEPS_BEFORE):
-        env.step(actions)
+        step(actions)
     bare = BareLoop(env.sim.mj_model, case.num_envs, NUM_THREADS, env.cfg.decimation)
     bare.expand({name: getattr(env.sim.model, name) for name in env.sim.expanded_fields})
 
@@ -91,7 +92,7 @@ def measure_case(case: Case) -> Row:
 
     same_states()
     env_time, bare_time = alternate(
-        bare, lambda: env.step(actions), steps=1, repeats=51, before=same_states
+        bare, lambda: step(actions), steps=1, repeats=51, before=same_states
     )[::-1]
     ratio = bare_time / env_time
     rays = ", same rays" if case.with_rays else ""
@@ -106,7 +107,10 @@ def measure_case(case: Case) -> Row:
 
 
 def measure(keyword: str = "") -> list[Row]:
-    """Measure every task whose name contains `keyword`."""
+    """Measure every task whose name contains `keyword`.
+
+    Steps are as those of training: in inference mode, with one thread of torch.
+    """
     torch.set_num_threads(1)
     return [measure_case(case) for case in CASES if keyword in case.task]
 

@@ -36,7 +36,9 @@ def measure() -> list[Row]:
     bare.ctrl[:] = actions.numpy()
 
     def stepping(env: ManagerBasedRlEnv) -> Sample:
-        return lambda: env.step(actions)
+        # As training steps.
+        step = torch.inference_mode()(env.step)
+        return lambda: step(actions)
 
     env_time, bare_time = alternate(stepping(env), bare)
     # A task that reads derived quantities makes the native engine run the forward as well.
