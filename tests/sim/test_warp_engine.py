@@ -85,9 +85,12 @@ def test_all_problems_are_named_at_once() -> None:
 
 
 def test_what_only_mujoco_warp_notices_is_refused_the_same_way() -> None:
-    speeds = LANDING_BOX.replace('"netforce" data="found force"', '"mindist" data="linvel"')
-    with pytest.raises(EngineUnavailableError, match="linvel.*--engine native"):
-        make_engine(speeds)
+    sheet = """
+    <mujoco><worldbody><body name="sheet"><freejoint/><geom size=".1" mass="1"/>
+      <flexcomp name="f" type="grid" count="3 3 1" spacing=".1 .1 .1" rigid="true" dim="2"/>
+    </body></worldbody></mujoco>"""
+    with pytest.raises(EngineUnavailableError, match="Rigid flexes.*--engine native"):
+        make_engine(sheet)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
