@@ -5,7 +5,9 @@ There is no GPU in these tests; `pretend_cuda` keeps the rules of one.
 
 from __future__ import annotations
 
+import copy
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -14,26 +16,29 @@ import numpy as np
 import pytest
 import torch
 
-from mjlab.envs import ManagerBasedRlEnv
+from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.envs.env_checks import as_action
+from mjlab.managers import EventTermCfg
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
 from mjlab.tasks.registry import list_tasks, load_env_cfg, load_rl_cfg, load_runner_cls
+from mjlab.tasks.tracking.mdp import MotionCommand, MotionCommandCfg
 
 from .pretend_cuda import DEVICE, PretendCuda, install, is_marked
 
 NUM_ENVS = 4
-# What a step looks up on the device: which environments end, and which are due for the other three.
-LOOKED_UP = {
-    "envs/manager_based_rl_env.py _reset_done_envs: nonzero",
-    "managers/event_manager.py _apply_interval: nonzero",
-    "managers/command_manager.py compute: nonzero",
-    "tasks/tracking/mdp/motion_command.py _update_command: nonzero",
-}
-# Besides that, a step with resets draws from ranges of the config that it copies to the device, and
-# logs levels of terrain. `keep_apart` draws until objects are apart, which it has to look up.
-MOST_WAITS_OF_RESETS = 3
+# A step looks up once which environments end, and which are due for events and commands.
+LOOKED_UP = "managers/lookup.py look_up: cpu"
+# Besides that, a step with resets looks up commands again, draws from ranges of the config that it
+# copies to the device, counts failures of motions, and logs metrics and levels of terrain.
+MOST_WAITS_OF_RESETS = 5
 # With mirror images, and with what the runner of tracking does besides.
 LEARNED = ("Mjlab-Velocity-Flat-Unitree-Go1", "Mjlab-Tracking-Flat-Unitree-G1")
+# With an interval event, a command that places objects, and one with a clock of its own.
+COMPARED = (
+    "Mjlab-Velocity-Flat-Unitree-Go1",
+    "Mjlab-Lift-Cube-Yam",
+    "Mjlab-Tracking-Flat-Unitree-G1",
+)
 EPISODE_STEPS = 6
 
 
@@ -45,7 +50,7 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> Iterator[PretendCuda]:
         yield mode
 
 
-def make_env(task: str, episode_steps: int | None = None) -> ManagerBasedRlEnv:
+def make_cfg(task: str, episode_steps: int | None = None) -> ManagerBasedRlEnvCfg:
     cfg = load_env_cfg(task)
     cfg.scene.num_envs, cfg.seed = NUM_ENVS, 1
     if episode_steps is not None:
@@ -53,7 +58,30 @@ def make_env(task: str, episode_steps: int | None = None) -> ManagerBasedRlEnv:
     if cfg.scene.terrain and cfg.scene.terrain.terrain_generator:
         cfg.scene.terrain.terrain_generator.num_rows = 2
         cfg.scene.terrain.terrain_generator.num_cols = 2
-    return ManagerBasedRlEnv(cfg, device=DEVICE)
+    return cfg
+
+
+def make_env(task: str, episode_steps: int | None = None) -> ManagerBasedRlEnv:
+    return ManagerBasedRlEnv(make_cfg(task, episode_steps), device=DEVICE)
+
+
+def make_due(env: ManagerBasedRlEnv, ids: slice) -> None:
+    """Let interval events happen in these environments, and commands be drawn, in the next step."""
+    for timer in env.event_manager._timers.values():
+        timer[ids] = 0.0
+    for name in env.command_manager.active_terms:
+        if not isinstance(command := env.command_manager.get_term(name), MotionCommand):
+            command.time_left[ids] = 0.0
+
+
+def counted(cuda: PretendCuda) -> Counter[str]:
+    """Return the waits by place, without those that draw until objects are apart, and zero all."""
+    waits = Counter[str]()
+    for place, count in cuda.waits.items():
+        if " keep_apart: " not in place:
+            waits[re.sub(r":\d+ ", " ", place)] += count
+    cuda.waits.clear()
+    return waits
 
 
 # The pretended device.
@@ -119,19 +147,23 @@ def test_a_task_builds_steps_and_resets_on_the_device(cuda, task):
     observations, _ = env.reset()
     actions = torch.zeros(NUM_ENVS, env.action_manager.total_action_dim, device=DEVICE)
     env.step(actions)
+    # Ranges of events are copied to the device by the first draw.
+    make_due(env, slice(None))
+    env.step(actions)
     cuda.waits.clear()
     cuda.rounded.clear()
     env.step(actions)
-    waits = {re.sub(r":\d+ ", " ", place): count for place, count in cuda.waits.items()}
-    assert waits.keys() <= LOOKED_UP
-    assert set(waits.values()) == {1}
+    assert counted(cuda) == {LOOKED_UP: 1}
+    make_due(env, slice(1, 3))
+    env.step(actions)
+    assert counted(cuda) == {LOOKED_UP: 1}
     # Some episodes end, and the others go on.
+    make_due(env, slice(1, 3))
     env.episode_length_buf[:2] = 10**9
-    without = cuda.waits.total()
-    cuda.waits.clear()
     observations, *returned, extras = env.step(actions)
-    drawn_again = sum(n for place, n in cuda.waits.items() if " keep_apart: " in place)
-    assert cuda.waits.total() - without - drawn_again <= MOST_WAITS_OF_RESETS, cuda.waits
+    waits = counted(cuda)
+    assert waits[LOOKED_UP] == 1 + bool(env.command_manager.active_terms)
+    assert waits.total() - 1 <= MOST_WAITS_OF_RESETS, waits
     assert not cuda.rounded, "TF32 may round these; use sums of products"
     assert (returned[-1].cpu() == torch.tensor([True, True, False, False])).all()
     for value in (*observations.values(), *returned):
@@ -140,6 +172,68 @@ def test_a_task_builds_steps_and_resets_on_the_device(cuda, task):
     env.load_state_dict(env.state_dict())
     env.sim.copy_to_host(1)
     env.close()
+
+
+def test_a_timer_for_all_environments_is_not_drawn_on_the_device(cuda):
+    cfg = make_cfg("Mjlab-Cartpole-Balance")
+    cfg.events["all"] = EventTermCfg(
+        func=lambda env, env_ids: None,
+        mode="interval",
+        interval_range_s=(0.0, 0.0),
+        is_global_time=True,
+    )
+    env = ManagerBasedRlEnv(cfg, device=DEVICE)
+    env.reset()
+    actions = torch.zeros(NUM_ENVS, 1, device=DEVICE)
+    env.step(actions)
+    cuda.waits.clear()
+    env.step(actions)
+    assert counted(cuda) == {LOOKED_UP: 1}
+    env.close()
+
+
+def interfere(env, env_ids):
+    """Change, as no term that ships does, what the step has looked up already."""
+    step = env.common_step_counter
+    if step % 5 == 0:
+        env.reset_buf[step % NUM_ENVS] = True
+    for name in env.command_manager.active_terms:
+        term = env.command_manager.get_term(name)
+        if step % 3 == 0:
+            term.time_left[step % NUM_ENVS] = 0.0
+        if step % 4 == 0 and isinstance(term, MotionCommand):
+            term.time_steps[step % NUM_ENVS] = term.motion.lengths[0] - 1
+
+
+@pytest.mark.parametrize("interferes", [False, True])
+@pytest.mark.parametrize("task", COMPARED)
+def test_what_is_looked_up_ahead_is_what_the_cpu_looks_up_when_needed(cuda, task, interferes):
+    cfg = make_cfg(task, EPISODE_STEPS)
+    # Motions may be over within an episode.
+    cfg.terminations["motion_ended"] = None
+    for event in cfg.events.values():
+        if event.mode == "interval":
+            event.interval_range_s = (0.03, 0.1)
+    for command in cfg.commands.values():
+        if not isinstance(command, MotionCommandCfg):
+            command.resampling_time_range = (0.0, 0.1)
+    if interferes:
+        cfg.events["interfere"] = EventTermCfg(func=interfere, mode="step")
+    steps = {}
+    for device in ("cpu", DEVICE):
+        env = ManagerBasedRlEnv(copy.deepcopy(cfg), device=device)
+        env.reset()
+        actions = torch.ones(NUM_ENVS, env.action_manager.total_action_dim, device=device)
+        steps[device] = []
+        for _ in range(2 * EPISODE_STEPS + 3):
+            with torch.inference_mode():
+                observations, reward, *_ = env.step(actions)
+            counts = [term.command_counter for term in env.command_manager._terms.values()]
+            values = (*observations.values(), reward, env.sim.data.qvel, *counts)
+            steps[device].append([value.cpu().clone() for value in values])
+        env.close()
+    for on_cpu, on_cuda in zip(*steps.values(), strict=True):
+        assert all(map(torch.equal, on_cpu, on_cuda))
 
 
 def test_an_array_of_actions_goes_to_the_device(cuda):

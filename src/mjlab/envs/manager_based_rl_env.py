@@ -32,6 +32,7 @@ from mjlab.managers import (
     TerminationManager,
 )
 from mjlab.managers.debug_vis import SensorSwitches
+from mjlab.managers.lookup import Lookup, look_up
 from mjlab.scene import Scene
 from mjlab.sim.engine import resolve_engine_name
 from mjlab.sim.simulation import Simulation
@@ -93,6 +94,10 @@ class ManagerBasedRlEnv:
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=device)
         self._pending_reset = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
         self._nan_resets = torch.zeros(self.num_envs, dtype=torch.long, device=device)
+        # What `_command_dt` returns in a step with resets.
+        self._command_dts = torch.zeros(self.num_envs, dtype=torch.float32, device=device)
+        self._ended = Lookup()
+        self._looks_ahead = torch.device(device).type == "cuda"
         self._renderer: OffscreenRenderer | None = None
         self._renderer_is_open = False
         if render_mode == "rgb_array":
@@ -313,14 +318,19 @@ class ManagerBasedRlEnv:
         self._terminate_diverged()
         self.reward_buf = self.reward_manager.compute(dt=self.step_dt)
         self.metrics_manager.compute()
+        self._look_ahead()
         for mode in ("step", "interval"):
             if mode in self.event_manager.available_modes:
                 self.event_manager.apply(mode=mode, dt=self.step_dt)
 
         moved = self.scene.take_moved_envs()
         reset_ids = self._reset_done_envs()
+        command_dt = self._command_dt(reset_ids)
+        if self._looks_ahead and len(reset_ids) > 0:
+            # Resets redrew their timers. Here the GPU has less left to do than after `forward`.
+            look_up(self.command_manager.plan_lookups(command_dt))
         self._forward(reset_ids, moved)
-        self._compute_commands(dt=self._command_dt(reset_ids))
+        self._compute_commands(dt=command_dt)
         self.sim.sense()
         self.obs_buf = self.observation_manager.compute(update_history=True)
         if self.cfg.auto_reset:
@@ -377,11 +387,28 @@ class ManagerBasedRlEnv:
         self._nan_resets += diverged
         self.extras["log"]["Simulation/nan_resets"] = diverged.sum()
 
+    def _look_ahead(self) -> None:
+        """On a GPU, look up in one wait which environments end, and are due for events and commands.
+
+        On the CPU a look-up costs least where it is needed.
+        """
+        if not self._looks_ahead:
+            return
+        lookups = [
+            *self.event_manager.plan_lookups(self.step_dt),
+            *self.command_manager.plan_lookups(self.step_dt),
+        ]
+        if self.cfg.auto_reset:
+            lookups.append(self._ended.plan(self.reset_buf, self.reset_buf))
+        look_up(lookups)
+
     def _reset_done_envs(self) -> torch.Tensor:
         """Reset environments that are done, under `auto_reset`; return their ids."""
         if not self.cfg.auto_reset:
             return self.reset_buf.new_empty(0, dtype=torch.long)
-        reset_ids = self.reset_buf.nonzero().flatten()
+        reset_ids = self._ended.take(self.reset_buf)
+        if reset_ids is None:
+            reset_ids = self.reset_buf.nonzero().flatten()
         if len(reset_ids) > 0:
             self.recorder_manager.record_pre_reset(reset_ids)
             self._reset_idx(reset_ids)
@@ -418,9 +445,7 @@ class ManagerBasedRlEnv:
         """Return the time that passed for commands: none where an episode has just begun."""
         if len(reset_ids) == 0:
             return self.step_dt
-        dt = torch.full((self.num_envs,), self.step_dt, dtype=torch.float32, device=self.device)
-        dt[reset_ids] = 0.0
-        return dt
+        return self._command_dts.fill_(self.step_dt).index_fill_(0, reset_ids, 0.0)
 
     def _refuse_pending_resets(self) -> None:
         if self._pending_reset.any():

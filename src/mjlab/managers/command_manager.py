@@ -14,6 +14,7 @@ from mjlab.managers.built_terms import BuiltTermsManager
 from mjlab.managers.debug_vis import DebugVisSwitches
 from mjlab.managers.env_ids import as_ids, is_empty
 from mjlab.managers.finite_mean import finite_mean
+from mjlab.managers.lookup import Lookup
 from mjlab.managers.manager_base import ManagerTermBase
 from mjlab.managers.null_managers import NullCommandManager as NullCommandManager
 
@@ -66,6 +67,7 @@ class CommandTerm(ManagerTermBase):
         self.metrics: dict[str, torch.Tensor] = {}
         self.time_left = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self.command_counter = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+        self._due = Lookup()
 
     @property
     def command(self) -> Any:
@@ -83,8 +85,10 @@ class CommandTerm(ManagerTermBase):
         """
         if env_ids is None:
             self._update_metrics()
+            due = self._due.take(self.time_left, dt)
             self.time_left -= dt
-            due = (self.time_left <= 0.0).nonzero().flatten()
+            if due is None:
+                due = (self.time_left <= 0.0).nonzero().flatten()
         else:
             if isinstance(dt, torch.Tensor) and dt.numel() != 1:
                 raise ValueError(
@@ -97,6 +101,13 @@ class CommandTerm(ManagerTermBase):
         if len(due) > 0:
             self._resample(due)
         self._update_command(env_ids)
+
+    def plan_lookups(self, dt: float | torch.Tensor) -> list[Lookup]:
+        """Plan the look-ups of `compute(dt)` for `look_up`, which is optional, and return them.
+
+        A subclass may add those of its `_update_command`.
+        """
+        return [self._due.plan(self.time_left - dt <= 0.0, self.time_left, dt)]
 
     def reset(self, env_ids: torch.Tensor | slice | None) -> dict[str, float]:
         """Draw new commands in these environments, and return and zero the mean of each metric.
@@ -210,6 +221,10 @@ class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
         """Advance all commands by `dt` seconds; see `CommandTerm.compute`."""
         for term in self._terms.values():
             term.compute(dt, env_ids)
+
+    def plan_lookups(self, dt: float | torch.Tensor) -> list[Lookup]:
+        """Plan the look-ups of all commands; see `CommandTerm.plan_lookups`."""
+        return [lookup for term in self._terms.values() for lookup in term.plan_lookups(dt)]
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
         """Reset all commands in these environments and return `Metrics/<command>/<metric>`."""

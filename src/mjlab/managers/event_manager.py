@@ -13,6 +13,7 @@ import torch
 from mjlab.compat import accepts_older_fields
 from mjlab.managers.debug_vis import TermFunctionSwitches
 from mjlab.managers.env_ids import as_ids, is_empty
+from mjlab.managers.lookup import Lookup
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
 from mjlab.managers.model_fields import (
     declared_model_fields,
@@ -65,13 +66,14 @@ class EventManager(TermFunctionSwitches, TermListManager):
 
     _cfg_type = EventTermCfg
     _leading = ("env", "env_ids")
-    _transient = {"_terms_by_mode"}
+    _transient = {"_terms_by_mode", "_lookups"}
 
     def __init__(self, cfg: Mapping[str, EventTermCfg | None], env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         self._terms_by_mode: dict[str, list[tuple[str, EventTermCfg]]] = {}
         # Seconds left: a tensor (num_envs,), or a number for a global timer.
         self._timers: dict[str, torch.Tensor | float] = {}
+        self._lookups: dict[str, Lookup] = {}
         # Environment step at which the event last happened, (num_envs,) int64.
         self._last_reset_step: dict[str, torch.Tensor] = {}
         for name, term in zip(self._term_names, self._term_cfgs, strict=True):
@@ -141,6 +143,14 @@ class EventManager(TermFunctionSwitches, TermListManager):
         if level != RecomputeLevel.none:
             self._env.sim.recompute_constants(level, reset_ids)
 
+    def plan_lookups(self, dt: float) -> list[Lookup]:
+        """Plan the look-ups of `apply("interval", dt=dt)` for `look_up`, which is optional."""
+        return [
+            self._lookups[name].plan(timer - dt < _TIMER_TOLERANCE, timer, dt)
+            for name, timer in self._timers.items()
+            if isinstance(timer, torch.Tensor)
+        ]
+
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
         """Reset terms of all modes and redraw the timers of these environments; logs nothing."""
         self._reset_class_terms(env_ids)
@@ -157,12 +167,14 @@ class EventManager(TermFunctionSwitches, TermListManager):
         if not isinstance(timer, torch.Tensor):
             timer -= dt
             due = timer < _TIMER_TOLERANCE
-            self._timers[name] = self._draw(cfg, 1).item() if due else timer
+            self._timers[name] = self._draw_global(cfg) if due else timer
             if due:
                 cfg.func(self._env, None, **cfg.params)
             return due
+        ids = self._lookups[name].take(timer, dt)
         timer.sub_(dt)
-        ids = (timer < _TIMER_TOLERANCE).nonzero().flatten()
+        if ids is None:
+            ids = (timer < _TIMER_TOLERANCE).nonzero().flatten()
         if len(ids) == 0:
             return False
         timer[ids] = self._draw(cfg, len(ids))
@@ -223,13 +235,19 @@ class EventManager(TermFunctionSwitches, TermListManager):
                 f"{self._label(name)}: mode 'interval' needs interval_range_s=(shortest, longest) "
                 "in seconds."
             )
+        self._lookups[name] = Lookup()
         self._timers[name] = (
-            self._draw(cfg, 1).item() if cfg.is_global_time else self._draw(cfg, self.num_envs)
+            self._draw_global(cfg) if cfg.is_global_time else self._draw(cfg, self.num_envs)
         )
 
-    def _draw(self, cfg: EventTermCfg, count: int) -> torch.Tensor:
+    def _draw(self, cfg: EventTermCfg, count: int, device: str | None = None) -> torch.Tensor:
         low, high = cfg.interval_range_s or (0.0, 0.0)
-        return torch.rand(count, dtype=torch.float32, device=self.device) * (high - low) + low
+        drawn = torch.rand(count, dtype=torch.float32, device=device or self.device)
+        return drawn * (high - low) + low
+
+    def _draw_global(self, cfg: EventTermCfg) -> float:
+        # On the host, which would wait for a number drawn on a GPU.
+        return self._draw(cfg, 1, "cpu").item()
 
     def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
         terms = zip(self._term_names, self._term_cfgs, strict=True)

@@ -38,6 +38,10 @@ class NullCommandManager(NullManager):
     def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
         """Do nothing."""
 
+    def plan_lookups(self, dt: float | torch.Tensor) -> list[Any]:
+        """Return no look-ups."""
+        return []
+
     def get_command(self, name: str) -> None:
         """Return None."""
 

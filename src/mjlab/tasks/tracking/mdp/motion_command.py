@@ -10,6 +10,7 @@ import torch
 
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.env_ids import as_ids, is_empty
+from mjlab.managers.lookup import Lookup
 from mjlab.tasks.tracking.mdp.command_checks import check_command_cfg, find_robot, read_library
 from mjlab.tasks.tracking.mdp.motion_drawing import MotionDrawing
 from mjlab.tasks.tracking.mdp.motion_panel import MotionPanel
@@ -149,6 +150,7 @@ class MotionCommand(MotionReader, CommandTerm):
         self._counted_at = torch.full_like(self.time_steps, -1)
         self._moved: list[torch.Tensor] = []
         self._started: list[torch.Tensor] = []
+        self._over = Lookup()
         # Frames are of motions with these lengths: by their shapes, the state of a run on other
         # motions is refused, whose frames may not exist here.
         lengths = self.motion.lengths.tolist()
@@ -327,6 +329,15 @@ class MotionCommand(MotionReader, CommandTerm):
             # Also where the reference is not drawn.
             self._panel.update()
 
+    def plan_lookups(self, dt: float | torch.Tensor) -> list[Lookup]:
+        """Plan the look-ups of `compute(dt)`; see `CommandTerm.plan_lookups`."""
+        is_over = self._is_over(self.time_steps + 1)
+        over = self._over.plan(is_over, self.time_steps, self.motion_ids)
+        return [*super().plan_lookups(dt), over]
+
+    def _is_over(self, time_steps: torch.Tensor) -> torch.Tensor:
+        return time_steps >= self.motion.lengths[self.motion_ids]
+
     def _update_metrics(self) -> None:
         if self._started:
             # Their relative poses are still those of before the reset.
@@ -338,9 +349,10 @@ class MotionCommand(MotionReader, CommandTerm):
             self.metrics[name].copy_(value)
 
     def _update_command(self, env_ids: torch.Tensor | None = None) -> None:
+        over = None if env_ids is not None else self._over.take(self.time_steps, self.motion_ids)
         self.time_steps[slice(None) if env_ids is None else env_ids] += 1
-        is_over = self.time_steps >= self.motion.lengths[self.motion_ids]
-        over = is_over.nonzero().flatten()
+        if over is None:
+            over = self._is_over(self.time_steps).nonzero().flatten()
         if not is_empty(over):
             self._resample_command(over)
             if self.cfg.advance_after_teleport:
