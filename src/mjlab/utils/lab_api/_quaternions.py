@@ -14,17 +14,26 @@ def quat_mul(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
             f"quat_mul got shapes {tuple(q1.shape)} and {tuple(q2.shape)}; they must be equal "
             "(expand one of them)."
         )
-    w1, x1, y1, z1 = q1.unbind(-1)
-    w2, x2, y2, z2 = q2.unbind(-1)
-    return torch.stack(
-        (
-            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
-            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-        ),
-        dim=-1,
-    )
+    # Each component of q1 times all of q2: 16 operations, where the components of the product, one
+    # by one, take 29.
+    product = q1[..., :1] * q2
+    w, x, y, z = (product[..., k] for k in range(4))
+    xw, xx, xy, xz = (q1[..., 1:2] * q2).unbind(-1)
+    w -= xx
+    x += xw
+    y -= xz
+    z += xy
+    yw, yx, yy, yz = (q1[..., 2:3] * q2).unbind(-1)
+    w -= yy
+    x += yz
+    y += yw
+    z -= yx
+    zw, zx, zy, zz = (q1[..., 3:] * q2).unbind(-1)
+    w -= zz
+    x -= zy
+    y += zx
+    z += zw
+    return product
 
 
 def quat_conjugate(q: torch.Tensor) -> torch.Tensor:
