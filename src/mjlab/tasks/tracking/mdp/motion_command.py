@@ -213,7 +213,9 @@ class MotionCommand(MotionReader, CommandTerm):
         return MotionFrame(self, self._counted_over_all((self.time_steps - 1).clamp_(min=0)))
 
     def _counted_over_all(self, frames: torch.Tensor) -> torch.Tensor:
-        return frames if len(self.motion) == 1 else frames + self.motion.starts[self.motion_ids]
+        if len(self.motion) == 1:
+            return frames
+        return frames + self.motion.starts.index_select(0, self.motion_ids)
 
     def update_relative_body_poses(self) -> None:
         """Refresh the relative poses from the reference and the robot as they are now."""

@@ -77,23 +77,23 @@ class MotionReader:
     @property
     def anchor_pos_w(self) -> torch.Tensor:
         """(N, 3) position of the anchor in the reference."""
-        place = self.motion.body_pos_w[self.frame_indexes, self.anchor_index]
+        place = self.motion.body_pos_w[:, self.anchor_index].index_select(0, self.frame_indexes)
         return place.add_(self.scene.env_origins)
 
     @property
     def anchor_quat_w(self) -> torch.Tensor:
         """(N, 4) orientation of the anchor in the reference."""
-        return self.motion.body_quat_w[self.frame_indexes, self.anchor_index]
+        return self.motion.body_quat_w[:, self.anchor_index].index_select(0, self.frame_indexes)
 
     @property
     def anchor_lin_vel_w(self) -> torch.Tensor:
         """(N, 3) velocity of the anchor's origin in the reference."""
-        return self.motion.body_lin_vel_w[self.frame_indexes, self.anchor_index]
+        return self.motion.body_lin_vel_w[:, self.anchor_index].index_select(0, self.frame_indexes)
 
     @property
     def anchor_ang_vel_w(self) -> torch.Tensor:
         """(N, 3) angular velocity of the anchor in the reference."""
-        return self.motion.body_ang_vel_w[self.frame_indexes, self.anchor_index]
+        return self.motion.body_ang_vel_w[:, self.anchor_index].index_select(0, self.frame_indexes)
 
     # The robot.
 
@@ -170,27 +170,24 @@ class MotionReader:
                 part[env_ids] for part in (frames, origins, robot_pos, robot_quat)
             )
         # Along x and y the origins of environments cancel out.
-        body_pos = self.motion.body_pos_w.index_select(0, frames)
+        pos = self.motion.body_pos_w.index_select(0, frames)
         body_quat = self.motion.body_quat_w.index_select(0, frames)
-        anchor_pos, anchor_quat = body_pos[:, self.anchor_index], body_quat[:, self.anchor_index]
+        anchor_pos, anchor_quat = pos[:, self.anchor_index], body_quat[:, self.anchor_index]
         turn = yaw_quat(quat_mul(robot_quat, quat_inv(anchor_quat)))
         w, z = turn[:, :1], turn[:, 3:]
         # Written out, because a turn about z takes half of what any other takes.
         cos, sin = w * w - z * z, 2.0 * w * z
-        x = body_pos[..., 0] - anchor_pos[:, :1]
-        y = body_pos[..., 1] - anchor_pos[:, 1:2]
-        pos = torch.stack(
-            (
-                cos * x - sin * y + robot_pos[:, :1],
-                sin * x + cos * y + robot_pos[:, 1:2],
-                body_pos[..., 2] + origins[:, 2:],
-            ),
-            dim=-1,
-        )
-        qw, qx, qy, qz = body_quat.unbind(-1)
-        quat = torch.stack(
-            (w * qw - z * qz, w * qx - z * qy, w * qy + z * qx, w * qz + z * qw), dim=-1
-        )
+        x, y, height = pos.unbind(-1)
+        dx, dy = x - anchor_pos[:, :1], y - anchor_pos[:, 1:2]
+        torch.add(cos * dx - sin * dy, robot_pos[:, :1], out=x)
+        torch.add(sin * dx + cos * dy, robot_pos[:, 1:2], out=y)
+        height += origins[:, 2:]
+        quat, turned = body_quat * w.unsqueeze(1), body_quat * z.unsqueeze(1)
+        (qw, qx, qy, qz), (zw, zx, zy, zz) = quat.unbind(-1), turned.unbind(-1)
+        qw -= zz
+        qx -= zy
+        qy += zx
+        qz += zw
         return pos, quat
 
 

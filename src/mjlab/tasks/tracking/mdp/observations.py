@@ -58,11 +58,12 @@ def robot_body_ori_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
 
 def _two_columns(quat: torch.Tensor) -> torch.Tensor:
     """Return the first two columns of rotation matrices of unit quaternions, row by row, (..., 6)."""
-    w, x, y, z = quat.unbind(-1)
+    # Components apart from each other, for which a CPU needs half of the time.
+    w, x, y, z = quat.movedim(-1, 0).contiguous()
     xy, wz, xz, wy, yz, wx = x * y, w * z, x * z, w * y, y * z, w * x
     yy, xx, zz = y * y, x * x, z * z
     rows = (0.5 - yy - zz, xy - wz, xy + wz, 0.5 - xx - zz, xz - wy, yz + wx)
-    return torch.stack(rows, dim=-1).mul_(2.0)
+    return torch.stack(rows).mul_(2.0).movedim(0, -1).contiguous()
 
 
 __getattr__ = older_names(__name__)

@@ -36,8 +36,12 @@ def perturbed_start(
         Root states (n, 13), without origins of environments, and joint positions (n, nj).
     """
     count, device = len(frames), str(frames.device)
-    pos, quat = motion.body_pos_w[frames, 0], motion.body_quat_w[frames, 0]
-    lin_vel, ang_vel = motion.body_lin_vel_w[frames, 0], motion.body_ang_vel_w[frames, 0]
+    pos, quat, lin_vel, ang_vel = (
+        of_bodies[:, 0].index_select(0, frames)
+        for of_bodies in (
+            motion.body_pos_w, motion.body_quat_w, motion.body_lin_vel_w, motion.body_ang_vel_w
+        )
+    )  # fmt: skip
     joint_pos = motion.joint_pos[frames]
     pose = scale * _drawn(pose_range, count, device)
     turn = quat_from_euler_xyz(*pose[:, 3:].unbind(1))

@@ -22,18 +22,27 @@ def tracking_metrics(motion: MotionReader) -> dict[str, torch.Tensor]:
     """
     anchor = motion.anchor_index
     pos, quat = motion.robot_body_pos_w, motion.robot_body_quat_w
-    lin_error = _norm(motion.body_lin_vel_w - motion.robot_body_lin_vel_w)
-    ang_error = _norm(motion.body_ang_vel_w - motion.robot_body_ang_vel_w)
+    # (3, N, K): of positions and both velocities.
+    norms = _norm(
+        torch.stack(
+            (
+                motion.body_pos_relative_w - pos,
+                motion.body_lin_vel_w - motion.robot_body_lin_vel_w,
+                motion.body_ang_vel_w - motion.robot_body_ang_vel_w,
+            )
+        )
+    )
+    mean_pos, mean_lin_vel, mean_ang_vel = norms.mean(dim=2)
     body_rot = quat_error_magnitude(motion.body_quat_relative_w, quat)
     return {
         "error_anchor_pos": _norm(motion.anchor_pos_w - pos[:, anchor]),
         "error_anchor_rot": quat_error_magnitude(motion.anchor_quat_w, quat[:, anchor]),
-        "error_anchor_lin_vel": lin_error[:, anchor],
-        "error_anchor_ang_vel": ang_error[:, anchor],
-        "error_body_pos": _norm(motion.body_pos_relative_w - pos).mean(dim=1),
+        "error_anchor_lin_vel": norms[1, :, anchor],
+        "error_anchor_ang_vel": norms[2, :, anchor],
+        "error_body_pos": mean_pos,
         "error_body_rot": body_rot.mean(dim=1),
-        "error_body_lin_vel": lin_error.mean(dim=1),
-        "error_body_ang_vel": ang_error.mean(dim=1),
+        "error_body_lin_vel": mean_lin_vel,
+        "error_body_ang_vel": mean_ang_vel,
         "error_joint_pos": (motion.joint_pos - motion.robot_joint_pos).norm(dim=-1),
         "error_joint_vel": (motion.joint_vel - motion.robot_joint_vel).norm(dim=-1),
     }
