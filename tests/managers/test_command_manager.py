@@ -106,6 +106,16 @@ def test_reset_logs_and_zeroes_metrics_of_its_environments(env):
     assert manager.reset(torch.tensor([], dtype=torch.long)) == {}
 
 
+def test_metrics_of_several_types_are_logged_and_zeroed(env):
+    manager, term = make(env)
+    term.metrics |= {"count": torch.arange(4), "is_far": torch.tensor([True, False, True, True])}
+    log = manager.reset(torch.tensor([1, 2]))
+    assert log["Metrics/goal/count"] == 1.5
+    assert log["Metrics/goal/is_far"] == 0.5
+    assert term.metrics["count"].tolist() == [0, 0, 0, 3]
+    assert term.metrics["is_far"].tolist() == [True, False, False, True]
+
+
 @pytest.mark.parametrize("term_class", [Count, Rebinding])
 def test_a_partial_reset_leaves_the_metrics_of_others_alone(env, term_class):
     manager, term = make(env, term=term_class)

@@ -120,13 +120,13 @@ class CommandTerm(ManagerTermBase):
             return {}
         log: dict[str, float] = {}
         if self.metrics:
-            values = torch.stack([metric[ids].float() for metric in self.metrics.values()])
+            values = torch.stack(tuple(self.metrics.values()))[:, ids].float()
             is_measured = self._is_measured(ids)
             if is_measured is not None:
                 values.masked_fill_(~is_measured, torch.nan)
             log = dict(zip(self.metrics, finite_mean(values).tolist(), strict=True))
             for metric in self.metrics.values():
-                metric[ids] = 0.0
+                metric.index_fill_(0, ids, 0.0)
         self.command_counter[ids] = 0
         self._resample(ids)
         return log
