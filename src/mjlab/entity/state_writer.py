@@ -245,10 +245,14 @@ class StateWriter:
         self._note_move(env_ids)
 
     def _note_move(self, env_ids: EnvIds) -> None:
-        moved = torch.zeros(len(self.default_root_state), dtype=torch.bool, device=self.device)
-        moved[slice(None) if env_ids is None else env_ids] = True
         # A new tensor, because one that was made under `inference_mode` cannot be written outside.
-        self.moved_envs = moved if self.moved_envs is None else self.moved_envs | moved
+        if self.moved_envs is None:
+            size = len(self.default_root_state)
+            moved = torch.zeros(size, dtype=torch.bool, device=self.device)
+        else:
+            moved = self.moved_envs.clone()
+        moved[slice(None) if env_ids is None else env_ids] = True
+        self.moved_envs = moved
 
     def _read_velocity(
         self, what: str, velocity: torch.Tensor, env_ids: EnvIds
