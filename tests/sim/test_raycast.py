@@ -409,6 +409,23 @@ def test_rays_against_nothing_but_planes_are_those_of_mj_ray(planes, seed, slant
         assert geoms[env, r] == geom
 
 
+def test_rays_down_on_one_endless_plane_end_at_its_height_and_miss_from_below():
+    xml = """
+    <mujoco><worldbody>
+      <geom type="sphere" size="1" group="1"/>
+      <geom type="plane" size="0 0 1" pos="7 -8 -.25"/>
+    </worldbody></mujoco>
+    """
+    model = mujoco.MjModel.from_xml_string(xml)
+    sim = Simulation(2, SimulationCfg(engine="native"), model=model, device="cpu")
+    starts = ((3.0, 4.0, 1.5), (-1e4, 9.0, -0.25), (0.0, 0.0, -0.5), (0.0, 0.0, torch.nan))
+    origins, directions = rays(*((start, DOWN) for start in starts))
+    distances, normals, geoms = sim.raycast(origins, directions, (0,), None, torch.full((4,), 5.0))
+    assert distances.tolist() == [[1.75, 0.0, -1.0, -1.0]] * 2
+    assert normals.tolist() == [[[0.0, 0.0, 1.0]] * 2 + [[0.0, 0.0, 0.0]] * 2] * 2
+    assert geoms.tolist() == [[1, 1, -1, -1]] * 2
+
+
 @pytest.mark.parametrize(
     ("groups", "excluded", "is_alone"),
     [

