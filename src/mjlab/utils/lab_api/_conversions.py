@@ -82,14 +82,10 @@ def quat_from_euler_xyz(roll: torch.Tensor, pitch: torch.Tensor, yaw: torch.Tens
     half = 0.5 * torch.stack(torch.broadcast_tensors(roll, pitch, yaw))
     cr, cp, cy = torch.cos(half)
     sr, sp, sy = torch.sin(half)
+    # Products of yaw and pitch.
+    cc, cs, sc, ss = cy * cp, cy * sp, sy * cp, sy * sp
     return torch.stack(
-        (
-            cy * cp * cr + sy * sp * sr,
-            cy * cp * sr - sy * sp * cr,
-            cy * sp * cr + sy * cp * sr,
-            sy * cp * cr - cy * sp * sr,
-        ),
-        dim=-1,
+        (cc * cr + ss * sr, cc * sr - ss * cr, cs * cr + sc * sr, sc * cr - cs * sr), dim=-1
     )
 
 
