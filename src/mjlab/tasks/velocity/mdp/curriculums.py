@@ -169,8 +169,6 @@ def commands_vel(
                 bounds = stage.get(name)
                 if bounds is not None:
                     setattr(ranges, name, tuple(bounds))
-    return {
-        f"{name}_{end}": torch.tensor(float(bound), dtype=torch.float32)
-        for name in RANGES
-        for end, bound in zip(("min", "max"), getattr(ranges, name), strict=True)
-    }
+    bounds = [float(bound) for name in RANGES for bound in getattr(ranges, name)]
+    names = [f"{name}_{end}" for name in RANGES for end in ("min", "max")]
+    return dict(zip(names, torch.tensor(bounds, dtype=torch.float32).unbind(), strict=True))
