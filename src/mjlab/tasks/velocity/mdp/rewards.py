@@ -72,7 +72,7 @@ def track_linear_velocity(
     asset: Entity = env.scene[asset_cfg.name]
     command = velocity_command(env, command_name)
     error = asset.data.root_link_lin_vel_b.clone()
-    error[:, :2] -= command[:, :2]
+    error[:, :2].sub_(command[:, :2])
     return torch.exp(error.square().sum(dim=1) / -(std**2))
 
 
@@ -93,7 +93,7 @@ def track_angular_velocity(
     asset: Entity = env.scene[asset_cfg.name]
     command = velocity_command(env, command_name)
     error = asset.data.root_link_ang_vel_b.clone()
-    error[:, 2] -= command[:, 2]
+    error[:, 2].sub_(command[:, 2])
     return torch.exp(error.square().sum(dim=1) / -(std**2))
 
 
