@@ -66,11 +66,11 @@ class BareWarp:
                 owner = self._model if hasattr(self._model, name) else self._model.opt
                 own = TorchArray(getattr(owner, name)).tensor
                 own.copy_(getattr(sim.model, name).view(own.shape))
-            if engine.is_expanded("stat.meaninertia"):
+            if "stat.meaninertia" in engine.model_fields:
                 expand_model_fields(self._model, env.num_envs, ["stat.meaninertia"])
                 wait(env.device)
                 inertia = TorchArray(self._model.stat.meaninertia).tensor
-                inertia.copy_(engine.model_field("stat.meaninertia"))
+                inertia.copy_(engine.model_fields["stat.meaninertia"])
             self._rays = [_Rays(env, *call) for call in _recorded_rays(env)]
             wait(env.device)
             # Kernels are loaded by the first call. On a GPU the next ones replay a graph.

@@ -201,6 +201,8 @@ class Engine(ABC):
     """
 
     capabilities: Capabilities
+    model_fields: dict[str, torch.Tensor]
+    """Live (N, ...) tensors of the `MjModel` (and `MjOption`) fields that are expanded."""
 
     @abstractmethod
     def data_field(self, name: str) -> torch.Tensor:
@@ -214,14 +216,6 @@ class Engine(ABC):
         """
 
     @abstractmethod
-    def model_field(self, name: str) -> torch.Tensor:
-        """Return the live (N, ...) tensor of an expanded `MjModel` (or `MjOption`) field.
-
-        Raises:
-            ValueError: the field has not been expanded.
-        """
-
-    @abstractmethod
     def expand(self, fields: tuple[str, ...]) -> None:
         """Give every environment its own copy of `MjModel` fields, seeded with the shared values.
 
@@ -230,10 +224,6 @@ class Engine(ABC):
         Raises:
             ValueError: the engine cannot hold the field per environment, by name.
         """
-
-    @abstractmethod
-    def is_expanded(self, field: str) -> bool:
-        """Return whether the model field is held per environment."""
 
     @abstractmethod
     def hide_geoms(self, absent: torch.Tensor) -> None:

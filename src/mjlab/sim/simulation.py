@@ -15,7 +15,6 @@ import torch
 
 from mjlab.sim.config import SimulationCfg
 from mjlab.sim.engine import (
-    COLLISION_MASKS,
     CameraView,
     Capabilities,
     EngineUnavailableError,
@@ -181,7 +180,6 @@ class Simulation:
         self.model = FieldView(self._read_model_field, num_envs, "model")
         """Live `MjModel` fields; those not expanded are shared and read-only."""
         self._options = FieldView(self._read_option, num_envs, "model.opt")
-        self._expanded: set[str] = set()
         if variant_info:
             self._apply_variants(variant_info)
         self._forward_callbacks: list[Callable[[Stage], None]] = []
@@ -190,7 +188,7 @@ class Simulation:
             cfg.nan_guard,
             num_envs,
             self.mj_model,
-            model_fields=lambda: {name: getattr(self.model, name) for name in self._expanded},
+            model_fields=lambda: {name: getattr(self.model, name) for name in self.expanded_fields},
         )
         logger.debug("Physics: %s, %d environments.", self.capabilities.description, num_envs)
 
@@ -244,7 +242,7 @@ class Simulation:
     @property
     def expanded_fields(self) -> set[str]:
         """Names of model fields that each environment has for itself."""
-        return set(self._expanded)
+        return set(self._engine.model_fields)
 
     @property
     def per_world_default_fields(self) -> set[str]:
@@ -307,8 +305,8 @@ class Simulation:
     def _read_model_field(self, name: str) -> Any:
         if name == "opt":
             return self._options
-        if self._engine.is_expanded(name):
-            return _reshape_rows(name, self._engine.model_field(name))
+        if name in self._engine.model_fields:
+            return _reshape_rows(name, self._engine.model_fields[name])
         try:
             value = self._host_value(name)
         except ValueError as error:
@@ -342,7 +340,6 @@ class Simulation:
             getattr(self.model, name).copy_(self.get_default_field(name))
         if self.absent_geoms is not None:
             self._engine.hide_geoms(self.absent_geoms)
-            self._expanded.update(COLLISION_MASKS)
         self._engine.forward(None)
 
     def expand_model_fields(self, fields: tuple[str, ...] | list[str]) -> None:
@@ -356,11 +353,10 @@ class Simulation:
             ValueError: no such field, or one that the engine cannot hold per environment.
         """
         names = (name.removeprefix("opt.") for name in fields)
-        new = tuple(name for name in names if name not in self._expanded)
+        new = tuple(name for name in names if name not in self._engine.model_fields)
         for name in new:
             self.get_default_field(name)
         self._engine.expand(new)
-        self._expanded.update(new)
         self.model.forget(new)
         self._options.forget(new)
 

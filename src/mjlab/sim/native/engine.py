@@ -131,7 +131,7 @@ class NativeEngine(Engine):
         self._outputs: dict[str, _Copy] = {}
         self._tensors: dict[str, torch.Tensor] = {}
         self._model_copies: dict[str, _Input] = {}
-        self._model_tensors: dict[str, torch.Tensor] = {}
+        self.model_fields: dict[str, torch.Tensor] = {}
         # (nsensordata,) columns of `sensordata` that a stage computes.
         stages = np.repeat(self._model.sensor_needstage, self._model.sensor_dim)
         self._sensor_columns = {
@@ -207,17 +207,9 @@ class NativeEngine(Engine):
                 self._batch.state[:] = kept
                 field.copy_out(rows, self._sensor_columns[stage] if name == "sensordata" else None)
 
-    def model_field(self, name: str) -> torch.Tensor:
-        if name not in self._model_tensors:
-            raise ValueError(f"MjModel field {name!r} has not been expanded.")
-        return self._model_tensors[name]
-
-    def is_expanded(self, field: str) -> bool:
-        return field in self._model_tensors
-
     def expand(self, fields: tuple[str, ...]) -> None:
         for name in fields:
-            if name in self._model_tensors:
+            if name in self.model_fields:
                 continue
             self._check_expandable(name)
             for mark in _FRAME_MARKS.get(name, ()):
@@ -228,7 +220,7 @@ class NativeEngine(Engine):
             if _seam_type(values) != values.dtype:
                 self._model_copies[name] = _Input(values, _seam_type(values))
                 values = self._model_copies[name].values
-            self._model_tensors[name] = _like_mujoco(name, values)
+            self.model_fields[name] = _like_mujoco(name, values)
 
     @staticmethod
     def _model_name(name: str) -> str:
@@ -263,7 +255,7 @@ class NativeEngine(Engine):
         for name in COLLISION_MASKS:
             array = self._batch.expand(name)
             array[absent.numpy()] = 0
-            self._model_tensors[name] = _as_tensor(array)
+            self.model_fields[name] = _as_tensor(array)
 
     # Physics.
 
@@ -394,7 +386,7 @@ class NativeEngine(Engine):
             self._bounds.expand(name)[:] = self._batch.expand(name)
         self._call(self._bounds.set_const, env_ids)
         # Bounding spheres, which the rays of MuJoCo 4 mind, unless they are written by others.
-        for name in {*_BOUNDING_VOLUMES, "geom_rbound"} - self._model_tensors.keys():
+        for name in {*_BOUNDING_VOLUMES, "geom_rbound"} - self.model_fields.keys():
             self._batch.expand(name)[:] = self._bounds.expand(name)
 
     def constants_written_by(self, level: int) -> tuple[str, ...]:
@@ -434,7 +426,7 @@ class NativeEngine(Engine):
 
     @functools.cached_property
     def _rays(self) -> NativeRays:
-        return NativeRays(self._model, self._batch, self.data_field, self._model_tensors)
+        return NativeRays(self._model, self._batch, self.data_field, self.model_fields)
 
     @functools.cached_property
     def _renderer(self) -> NativeRenderer:
@@ -444,7 +436,7 @@ class NativeEngine(Engine):
             self._batch.nthread,
             self._make_batch,
             self.data_field,
-            self._model_tensors,
+            self.model_fields,
         )
 
     def _make_batch(
@@ -499,7 +491,7 @@ class NativeEngine(Engine):
                 if name in ACCELERATION_FIELDS or name == "sensordata"
             },
             "model": {
-                name: raw.get(name, value).clone() for name, value in self._model_tensors.items()
+                name: raw.get(name, value).clone() for name, value in self.model_fields.items()
             },
         }
 
@@ -530,7 +522,7 @@ class NativeEngine(Engine):
                 self._model_copies[name].source.copy_(value)
                 self._model_copies[name].copy_out()
             else:
-                self._model_tensors[name].copy_(value)
+                self.model_fields[name].copy_(value)
         if not self._model_copies.keys().isdisjoint(_BOUNDED):
             self._fit_bounding_volumes(None)
         self._rows.copy_(state["state"])

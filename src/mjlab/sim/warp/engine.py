@@ -136,7 +136,7 @@ class WarpEngine(Engine):
             self._allocate(model, cfg)
         cfg.apply_wp_opt(self.wp_model.opt)
         self._data_tensors: dict[str, torch.Tensor] = {}
-        self._model_tensors: dict[str, torch.Tensor] = {}
+        self.model_fields: dict[str, torch.Tensor] = {}
         self._graphs: dict[str, Any] = {}
         self._captures = True
         self._absent: torch.Tensor | None = None
@@ -310,23 +310,15 @@ class WarpEngine(Engine):
             self._data_tensors[name] = as_torch(array).view(self.num_envs, *shape)
         return self._data_tensors[name]
 
-    def model_field(self, name: str) -> torch.Tensor:
-        if name not in self._model_tensors:
-            raise ValueError(f"MjModel field {name!r} has not been expanded.")
-        return self._model_tensors[name]
-
-    def is_expanded(self, field: str) -> bool:
-        return field in self._model_tensors
-
     @torch.inference_mode(False)
     def expand(self, fields: tuple[str, ...]) -> None:
-        new = [name for name in dict.fromkeys(fields) if name not in self._model_tensors]
+        new = [name for name in dict.fromkeys(fields) if name not in self.model_fields]
         with self.ordered():
             arrays = expand_arrays(self.wp_model, self.num_envs, new)
         for name, array in zip(new, arrays, strict=True):
             tensor = as_torch(array)
             # MuJoCo stores centers and half sizes in one row.
-            self._model_tensors[name] = tensor.flatten(-2) if name == "geom_aabb" else tensor
+            self.model_fields[name] = tensor.flatten(-2) if name == "geom_aabb" else tensor
         # A graph keeps the addresses of the arrays it was captured with.
         if new and self.num_envs > 1:
             self._graphs.clear()
@@ -339,13 +331,13 @@ class WarpEngine(Engine):
         # For those who read them: Warp itself has one for all environments.
         for name in COLLISION_MASKS:
             mask = torch.as_tensor(getattr(self.mj_model, name), device=self.device)
-            self._model_tensors[name] = mask.expand(absent.shape).masked_fill(absent, 0)
+            self.model_fields[name] = mask.expand(absent.shape).masked_fill(absent, 0)
 
     def constants_written_by(self, level: int) -> tuple[str, ...]:
         names: tuple[str, ...] = ()
         if level in (1, 3):
             names += FIXED_CONSTANTS
-            if not self._model_tensors.keys().isdisjoint(("geom_size", *_GEOM_BOUNDS)):
+            if not self.model_fields.keys().isdisjoint(("geom_size", *_GEOM_BOUNDS)):
                 names += _GEOM_BOUNDS
         if level in (2, 3):
             names += CONSTANTS_AT_QPOS0
@@ -355,7 +347,7 @@ class WarpEngine(Engine):
         written = self.constants_written_by(level)
         self.expand(written)
         others = self._rows_except(env_ids)
-        kept = [(self._model_tensors[name], others) for name in written if others is not None]
+        kept = [(self.model_fields[name], others) for name in written if others is not None]
         with _keeping(kept):
             with self.ordered():
                 _RECOMPUTE[level](self.wp_model, self.wp_data)
@@ -443,7 +435,7 @@ class WarpEngine(Engine):
             elif others is not None and name in results:
                 kept.append((tensor, others))
         with _keeping(kept):
-            if len(self._static_geoms) and not _STATIC_POSE.isdisjoint(self._model_tensors):
+            if len(self._static_geoms) and not _STATIC_POSE.isdisjoint(self.model_fields):
                 self._place_static_geoms()
             self.launch(stage, lambda: self._forward(stage))
 
@@ -580,7 +572,7 @@ class WarpEngine(Engine):
             "data": {name: self.data_field(name) for name in _STATE_FIELDS},
             # No forward pass gives these as the last substep did.
             "results": self._last_results(),
-            "model": self._model_tensors,
+            "model": self.model_fields,
         }
         return {
             kind: {name: tensor.cpu().clone() for name, tensor in fields.items()}
@@ -596,7 +588,7 @@ class WarpEngine(Engine):
                 )
         self.expand(tuple(state["model"]))
         for name, value in state["model"].items():
-            self._model_tensors[name].copy_(value)
+            self.model_fields[name].copy_(value)
         for name, value in state["data"].items():
             self.data_field(name).copy_(value)
         # Earlier releases saved no results, or those that were read.

@@ -47,7 +47,7 @@ class WarpRenderer:
             settings = (view.geom_groups, view.use_textures, view.use_shadows)
             by_settings.setdefault(settings, {})[i] = view
         images: dict[int, Images] = {}
-        relevant = frozenset(filter(self._engine.is_expanded, _CONTEXT_FIELDS))
+        relevant = _CONTEXT_FIELDS & self._engine.model_fields.keys()
         for settings, members in by_settings.items():
             scene = self._scenes.get((views, settings))
             if scene is None or scene.expanded != relevant:
