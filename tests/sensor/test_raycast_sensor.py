@@ -360,7 +360,9 @@ def test_sensors_that_see_the_same_groups_are_cast_together(monkeypatch):
     queries = []
     cast = sim._engine.raycast
     monkeypatch.setattr(
-        sim._engine, "raycast", lambda *args: queries.append(args[0].shape[1]) or cast(*args)
+        sim._engine,
+        "raycast",
+        lambda query: queries.append(query.origins.shape[1]) or cast(query),
     )
     sense(sim)
     assert queries == [242, 121]

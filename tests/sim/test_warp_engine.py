@@ -21,7 +21,7 @@ from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg, mdp
 from mjlab.managers import EventTermCfg, SceneEntityCfg
 from mjlab.scene import SceneCfg
 from mjlab.sim.config import MujocoCfg, SimulationCfg
-from mjlab.sim.engine import Engine, EngineUnavailableError
+from mjlab.sim.engine import Engine, EngineUnavailableError, RayQuery
 from mjlab.sim.randomization import expand_model_fields
 from mjlab.sim.sim_data import TorchArray, WarpBridge
 from mjlab.sim.warp.engine import WarpEngine
@@ -509,11 +509,11 @@ def test_rays_hit_only_the_groups_and_bodies_asked_for() -> None:
     engine = make_engine(LANDING_BOX)
     down = torch.tensor([0.0, 0.0, -1.0]).expand(2, 2, 3)
     start = torch.tensor([-0.05, 0.1, 2.0]).expand(2, 2, 3)
-    distances, normals, geoms = engine.raycast(start, down, None, torch.tensor([-1, 1]))
+    distances, normals, geoms = engine.raycast(RayQuery(start, down, None, torch.tensor([-1, 1])))
     torch.testing.assert_close(distances, torch.tensor([[1.55, 2.0]] * 2))
     assert geoms.tolist() == [[1, 0]] * 2
     torch.testing.assert_close(normals, torch.tensor([0.0, 0.0, 1.0]).expand(2, 2, 3))
-    distances, normals, geoms = engine.raycast(start, down, (3,), None)
+    distances, normals, geoms = engine.raycast(RayQuery(start, down, (3,)))
     assert (distances == -1).all()
     assert (geoms == -1).all()
     assert not normals.any()
@@ -627,7 +627,7 @@ def test_torch_computes_nothing_that_warp_reads_within_the_same_wait() -> None:
     rays = torch.zeros(3, 4, 2).permute(2, 1, 0)
     with work:
         engine.jacobian(points, bodies)
-        engine.raycast(rays, rays - 1.0, None, torch.ones(8, dtype=torch.int64)[::2])
+        engine.raycast(RayQuery(rays, rays - 1.0, None, torch.ones(8, dtype=torch.int64)[::2]))
         engine.step(1)
         engine.forward(torch.tensor([1]))
         engine.reset(torch.tensor([0]))
@@ -743,8 +743,8 @@ def test_rays_replay_one_graph_for_all_sensors(as_on_cuda: None) -> None:
     captured = engine._graphs.keys() - {"step", "pos", "vel", "acc"}
     down = torch.tensor([0.0, 0.0, -1.0]).expand(2, 3, 3)
     start = torch.tensor([-0.05, 0.1, 2.0]).expand(2, 3, 3)
-    first = engine.raycast(start, down, None, None)
-    engine.raycast(start, down, None, torch.tensor([-1, -1, 1]))
+    first = engine.raycast(RayQuery(start, down))
+    engine.raycast(RayQuery(start, down, None, torch.tensor([-1, -1, 1])))
     captured = engine._graphs.keys() - {"step", "pos", "vel", "acc"}
     assert len(captured) == 1
     torch.testing.assert_close(first[0], torch.full((2, 3), 1.55))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 from abc import ABC, abstractmethod
+from collections.abc import Container
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -85,6 +86,29 @@ def check_sensor_fed(model: mujoco.MjModel, field: str) -> None:
         )
 
 
+# Rays.
+
+
+@dataclass(frozen=True)
+class RayQuery:
+    """R world-frame rays in each of N environments."""
+
+    origins: torch.Tensor
+    """(N, R, 3) metres."""
+    directions: torch.Tensor
+    """(N, R, 3) unit vectors."""
+    geom_groups: tuple[int, ...] | None = None
+    """Groups that can be hit; None for all six."""
+    exclude_body_ids: torch.Tensor | None = None
+    """(R,) int32 body whose own geoms are ignored, -1 for none."""
+    max_distances: torch.Tensor | None = None
+    """(R,) metres; what is farther away is a miss. None for no limit."""
+
+
+RayHits = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+"""Distances (N, R), -1 on a miss; normals (N, R, 3), zero on a miss; geom ids (N, R) int32, -1 on a
+miss."""
+
 # Rendering.
 
 CameraDataType = Literal["rgb", "depth", "segmentation"]
@@ -150,7 +174,7 @@ class Images:
         return images
 
 
-def rendered_geoms(model: mujoco.MjModel, groups: tuple[int, ...]) -> list[int]:
+def rendered_geoms(model: mujoco.MjModel, groups: Container[int]) -> list[int]:
     """Return the geoms of some groups, ascending.
 
     MuJoCo counts a group beyond 0 to 5 as the nearest of these.
@@ -200,6 +224,7 @@ class Engine(ABC):
     unique on a CPU.
     """
 
+    num_envs: int
     capabilities: Capabilities
     model_fields: dict[str, torch.Tensor]
     """Live (N, ...) tensors of the `MjModel` (and `MjOption`) fields that are expanded."""
@@ -281,29 +306,12 @@ class Engine(ABC):
         """
 
     @abstractmethod
-    def raycast(
-        self,
-        origins: torch.Tensor,
-        directions: torch.Tensor,
-        geom_groups: tuple[int, ...] | None,
-        exclude_body_ids: torch.Tensor | None,
-        max_distances: torch.Tensor | None = None,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Cast R world-frame rays per environment at the current state.
+    def raycast(self, query: RayQuery) -> RayHits:
+        """Cast rays at the current state.
 
         A ray meets the nearest surface that it may meet: planes from above, the outside of
         meshes, the top of height fields from above, and either side of other geoms. A geom that is
         fully transparent (its material's alpha counts, where it has one) is not there.
-
-        Args:
-            origins: (N, R, 3) metres. directions: (N, R, 3) unit vectors.
-            geom_groups: groups that can be hit; None means all six.
-            exclude_body_ids: (R,) int32 body whose own geoms are ignored, -1 for none.
-            max_distances: (R,) metres; what is farther away is a miss. None for no limit.
-
-        Returns:
-            distances (N, R), -1 on a miss; normals (N, R, 3), zero on a miss; geom ids (N, R)
-            int32, -1 on a miss.
         """
 
     @abstractmethod

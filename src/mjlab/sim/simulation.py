@@ -19,6 +19,8 @@ from mjlab.sim.engine import (
     Capabilities,
     EngineUnavailableError,
     Images,
+    RayHits,
+    RayQuery,
     Stage,
     create_engine,
     resolve_engine_name,
@@ -462,7 +464,7 @@ class Simulation:
         geom_groups: tuple[int, ...] | None = None,
         exclude_body_ids: torch.Tensor | None = None,
         max_distances: torch.Tensor | None = None,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    ) -> RayHits:
         """Cast rays: (N, R, 3) world origins and unit directions.
 
         Returns distances (N, R) with -1 on a miss, normals (N, R, 3) with 0, geom ids (N, R) with
@@ -471,7 +473,7 @@ class Simulation:
         miss. Planes are hit from above only, meshes and height fields from outside only.
         """
         return self._engine.raycast(
-            origins, directions, geom_groups, exclude_body_ids, max_distances
+            RayQuery(origins, directions, geom_groups, exclude_body_ids, max_distances)
         )
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:

@@ -41,7 +41,7 @@ from mjlab.utils.processes import cores_per_process
 
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
-    from mjlab.sim.engine import CameraView, Images
+    from mjlab.sim.engine import CameraView, Images, RayHits, RayQuery
 
 logger = logging.getLogger(__name__)
 
@@ -408,16 +408,9 @@ class NativeEngine(Engine):
 
     # Queries.
 
-    def raycast(
-        self,
-        origins: torch.Tensor,
-        directions: torch.Tensor,
-        geom_groups: tuple[int, ...] | None,
-        exclude_body_ids: torch.Tensor | None,
-        max_distances: torch.Tensor | None = None,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def raycast(self, query: RayQuery) -> RayHits:
         self._copy_in()
-        return self._rays.cast(origins, directions, geom_groups, exclude_body_ids, max_distances)
+        return self._rays.cast(query)
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:
         if self.capabilities.render_problem is not None:
@@ -426,18 +419,11 @@ class NativeEngine(Engine):
 
     @functools.cached_property
     def _rays(self) -> NativeRays:
-        return NativeRays(self._model, self._batch, self.data_field, self.model_fields)
+        return NativeRays(self, self._model, self._batch)
 
     @functools.cached_property
     def _renderer(self) -> NativeRenderer:
-        return NativeRenderer(
-            self._model,
-            self.num_envs,
-            self._batch.nthread,
-            self._make_batch,
-            self.data_field,
-            self.model_fields,
-        )
+        return NativeRenderer(self, self._model, self._batch.nthread, self._make_batch)
 
     def _make_batch(
         self, model: mujoco.MjModel, count: int, num_threads: int | None = None

@@ -10,12 +10,16 @@ import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 import torch
-from mujoco.batch import SimulationError
+from mujoco.batch import Batch, SimulationError
+
+if TYPE_CHECKING:
+    from mjlab.sim.engine import Engine, RayHits, RayQuery
 
 logger = logging.getLogger(__name__)
 
@@ -48,20 +52,9 @@ _MIN_GEOMS = 12
 class NativeRays:
     """Casts the rays of a native engine."""
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        batch: Any,
-        data_field: Callable[[str], torch.Tensor],
-        expanded: Mapping[str, torch.Tensor],
-    ) -> None:
-        """Cast in `batch`, simulations of `model`.
-
-        `data_field` returns a field of `MjData` by name, (N, ...); `expanded` holds the fields of
-        `MjModel` that differ between environments, (N, ...).
-        """
-        self._model, self._batch = model, batch
-        self._data_field, self._expanded = data_field, expanded
+    def __init__(self, engine: Engine, model: mujoco.MjModel, batch: Batch) -> None:
+        """Cast in `batch`, the simulations of `model` that `engine` runs."""
+        self._engine, self._model, self._batch = engine, model, batch
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         self._pos, self._mat = data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
@@ -72,38 +65,30 @@ class NativeRays:
         self._fields_are_carried = self._is_carried[model.geom_type == _HFIELD].any()
         self._tables: dict[Any, tuple[GroundTable | None, bool]] = {}
 
-    def cast(
-        self,
-        origins: torch.Tensor,
-        directions: torch.Tensor,
-        geom_groups: tuple[int, ...] | None,
-        exclude_body_ids: torch.Tensor | None,
-        max_distances: torch.Tensor | None,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Cast rays (N, R); see `Engine.raycast`."""
-        excluded = np.array([-1]) if exclude_body_ids is None else exclude_body_ids.numpy()
-        starts, along = np.ascontiguousarray(origins.numpy()), directions.numpy()
-        hits = Hits.empty(*starts.shape[:2])
+    def cast(self, query: RayQuery) -> RayHits:
+        """Cast rays; see `Engine.raycast`."""
+        origins, directions = query.origins.numpy(), query.directions.numpy()
+        groups, excluded = query.geom_groups, np.array([-1])
+        if query.exclude_body_ids is not None:
+            excluded = query.exclude_body_ids.numpy()
+        cast_in_batch = partial(self._cast_in_batch, origins, directions, groups, excluded)
         table, has_others = None, True
         # Rows are compared with rows: a last dimension of three takes ten times as long.
-        if (along == np.tile(-_UP, (along.shape[1], 1))).all():
-            key = geom_groups, np.unique(excluded).tobytes()
+        if (directions == np.tile(-_UP, (directions.shape[1], 1))).all():
+            key = groups, np.unique(excluded).tobytes()
             if key not in self._tables:
-                self._tables[key] = self._ground(geom_groups, excluded)
+                self._tables[key] = self._ground(groups, excluded)
             table, has_others = self._tables[key]
-        if table is None or not table.is_current(self._expanded):
-            self._cast_in_batch(starts, along, geom_groups, excluded, hits)
+        if table is None or not table.is_current(self._engine.model_fields):
+            hits = cast_in_batch(static=True)
         else:
-            table.cast(starts, hits)
+            hits = table.cast(origins)
             if has_others:
-                others = Hits.empty(*starts.shape[:2])
-                self._cast_in_batch(starts, along, geom_groups, excluded, others, static=False)
-                hits.take_nearer(others)
-        if max_distances is not None:
-            hits.forget(hits.distances > max_distances.numpy())
-        distances, normals, geoms = map(
-            torch.from_numpy, (hits.distances, hits.normals, hits.geoms)
-        )
+                hits.take_nearer(cast_in_batch(static=False))
+        if query.max_distances is not None:
+            hits.forget(hits.distances > query.max_distances.numpy())
+        arrays = hits.distances, hits.normals, hits.geoms
+        distances, normals, geoms = map(torch.from_numpy, arrays)
         return distances, normals, geoms
 
     def _ground(
@@ -141,23 +126,23 @@ class NativeRays:
         directions: Array,
         groups: tuple[int, ...] | None,
         excluded: Array,
-        hits: Hits,
-        static: bool = True,
-    ) -> None:
+        static: bool,
+    ) -> Hits:
         """Cast against the geoms of the model, those that never move only if `static`."""
         n = len(origins)
         pos, mat = (np.broadcast_to(x, (n, *x.shape)) for x in (self._pos, self._mat))
         if self._fields_are_carried:
-            pos, mat = (self._data_field(name).numpy() for name in ("geom_xpos", "geom_xmat"))
+            pos, mat = (
+                self._engine.data_field(name).numpy() for name in ("geom_xpos", "geom_xmat")
+            )
 
         def passed(rows: Array, origins: Array, directions: Array, hits: Hits) -> Array:
             return self._rule.passed(origins, directions, hits, hits.geoms, rows, pos, mat)
 
-        cast_through(
+        return cast_through(
             self._batch,
             origins,
             directions,
-            hits,
             passed if self._rule.is_needed else None,
             geomgroup=_group_mask(groups),
             bodyexclude=excluded,
@@ -178,14 +163,11 @@ class Hits:
     geoms: Array
 
     @classmethod
-    def empty(cls, rows: int, rays: int) -> Hits:
-        """Allocate results, to be written."""
-        shape = (rows, rays)
-        return cls(
-            np.zeros(shape, np.float32),
-            np.zeros((*shape, 3), np.float32),
-            np.zeros(shape, np.int32),
-        )
+    def misses(cls, rows: int, rays: int) -> Hits:
+        """Return results of rays that meet nothing."""
+        normals = np.zeros((rows, rays, 3), np.float32)
+        misses = np.full((rows, rays), -1, np.int32)
+        return cls(misses.astype(np.float32), normals, misses)
 
     def __getitem__(self, rows: Any) -> Hits:
         return Hits(self.distances[rows], self.normals[rows], self.geoms[rows])
@@ -207,63 +189,55 @@ class Hits:
 
 
 def cast_through(
-    batch: Any,
-    origins: Array,
-    directions: Array,
-    hits: Hits,
-    passed: Passed | None,
-    rows: Array | None = None,
-    **options: Any,
-) -> None:
-    """Cast the rays of `rows` (None: all), through surfaces that do not count, into `hits`.
+    batch: Batch, origins: Array, directions: Array, passed: Passed | None, **options: Any
+) -> Hits:
+    """Cast rays in the first n simulations, through surfaces that do not count.
 
     Rays of simulations in which MuJoCo raises are misses.
 
     Args:
         batch: Simulations, one a row.
         origins: (n, R, 3). directions: (n, R, 3).
-        hits: Results, written.
         passed: Predicate of hits to ignore; None to ignore none.
-        rows: Sorted ids of simulations.
         options: Further arguments of `Batch.ray`.
     """
-    gone: Array | None = None
-    passes = 0
-    while True:
-        some: Any = slice(None) if rows is None else rows
-        try:
-            distances, geoms, normals = batch.ray(
-                origins[some], directions[some], ids=rows, normal=True, **options
-            )
-        except SimulationError as error:
-            # The results of the others are lost with it.
-            failed = hits[error.ids]
-            failed.forget(np.ones_like(failed.geoms, dtype=bool))
-            hits[error.ids] = failed
-            rows = np.setdiff1d(np.arange(len(origins)) if rows is None else rows, error.ids)
-            continue
-        hits[some] = Hits(distances, normals, geoms)
-        if passed is None:
-            return
-        repeat = passed(np.arange(len(origins))[some], origins[some], directions[some], hits[some])
+    rows = np.arange(len(origins))
+    hits = found = _cast(batch, rows, origins, directions, options)
+    if passed is None:
+        return hits
+    gone = np.zeros_like(hits.distances)
+    for passes in range(_MAX_PASSES + 1):
+        repeat = passed(rows, origins, directions, found)
         chosen = repeat.any(axis=1)
         if not chosen.any():
             break
-        if gone is None:
-            origins, gone = origins.copy(), np.zeros_like(hits.distances)
-        rows = np.flatnonzero(chosen) if rows is None else rows[chosen]
-        repeat, found = repeat[chosen], hits[rows]
+        rows, origins, directions = rows[chosen], origins[chosen], directions[chosen]
+        repeat, found, gone = repeat[chosen], found[chosen], gone[chosen]
         if passes == _MAX_PASSES:
             found.forget(repeat)
-            hits[rows] = found
-            break
-        passes += 1
-        behind = _BEHIND + _BEHIND_RELATIVE * np.abs(origins[rows]).max(axis=-1)
-        step = np.where(repeat, found.distances + behind, 0.0).astype(np.float32)
-        origins[rows] += step[..., None] * directions[rows]
-        gone[rows] += step
-    if gone is not None:
-        hits.distances += np.where(hits.distances >= 0.0, gone, 0.0)
+        else:
+            behind = _BEHIND + _BEHIND_RELATIVE * np.abs(origins).max(axis=-1)
+            step = np.where(repeat, found.distances + behind, 0.0).astype(np.float32)
+            origins, gone = origins + step[..., None] * directions, gone + step
+            found = _cast(batch, rows, origins, directions, options)
+        hits[rows] = found
+        hits.distances[rows] += np.where(found.distances >= 0.0, gone, 0.0)
+    return hits
+
+
+def _cast(
+    batch: Batch, rows: Array, origins: Array, directions: Array, options: dict[str, Any]
+) -> Hits:
+    """Cast rays (n, R, 3) in the simulations `rows` (n,)."""
+    try:
+        distances, geoms, normals = batch.ray(origins, directions, ids=rows, normal=True, **options)
+    except SimulationError as error:
+        # The results of the others are lost with it.
+        good = ~np.isin(rows, error.ids)
+        hits = Hits.misses(*origins.shape[:2])
+        hits[good] = _cast(batch, rows[good], origins[good], directions[good], options)
+        return hits
+    return Hits(distances.astype(np.float32), normals.astype(np.float32), geoms)
 
 
 class CullingRule:
@@ -407,15 +381,16 @@ class GroundTable:
         self._bottom = np.where(is_box, self._pos[2] - self._size[2], np.nan)
         self._top = self._pos[2] + self._size[2]
 
-    def cast(self, origins: Array, hits: Hits) -> None:
-        """Cast rays straight down from `origins` (n, R, 3) into `hits`."""
+    def cast(self, origins: Array) -> Hits:
+        """Cast rays straight down from `origins` (n, R, 3)."""
+        shape, up = origins.shape[:2], np.zeros(origins.shape, np.float32)
+        up[..., 2] = 1.0
         if self._level is not None:
             # 0.5 to 0.7 of the time that `sim.sense` takes otherwise (G1 and Go1 on flat ground).
             gaps = origins[..., 2].astype(np.float64) - self._level
-            hits.distances[:], hits.geoms[:] = gaps, self._geoms[0]
-            hits.normals[:] = np.tile(_UP, (origins.shape[1], 1))
+            hits = Hits(gaps.astype(np.float32), up, np.full(shape, self._geoms[0]))
             hits.forget(~((gaps >= 0.0) & (gaps < np.inf)))
-            return
+            return hits
         points = np.ascontiguousarray(origins.reshape(-1, 3).T, dtype=np.float64)
         x, y = (points[:2] - self._origin[:, None]) / self._edge
         # Positions that are NaN are beyond the border too.
@@ -423,8 +398,7 @@ class GroundTable:
         y = np.fmin(np.fmax(y, 0.0), self._shape[1] - 1).astype(np.int64)
         cell = x * self._shape[1] + y
         met = self._covering.take(cell)
-        hits.normals[:] = np.tile(_UP, (origins.shape[1], 1))
-        normals = hits.normals.reshape(-1, 3)
+        normals = up.reshape(-1, 3)
         # Most rays start above a geom that covers their cell.
         distance = self._gaps(met, points, normals)
         rays = np.flatnonzero(~(distance >= 0.0))
@@ -447,9 +421,10 @@ class GroundTable:
             entry += 1
             goes_on = starts[2] - self._top[self._entries[entry]] < distance[rays]
             rays, entry = rays[goes_on], entry[goes_on]
-        hits.distances[:] = distance.reshape(hits.distances.shape)
-        hits.geoms[:] = self._geoms.take(met).reshape(hits.geoms.shape)
-        hits.forget(~np.isfinite(hits.distances))
+        distances = distance.astype(np.float32).reshape(shape)
+        hits = Hits(distances, normals.reshape(origins.shape), self._geoms.take(met).reshape(shape))
+        hits.forget(~np.isfinite(distances))
+        return hits
 
     def _gaps(self, geom: Array, points: Array, normals: Array) -> Array:
         """Return heights (m,) of `points` (3, m) above the tops of `geom`; set normals of fields."""

@@ -7,7 +7,7 @@ few geoms stand for those in its sight. Everything is in the frame of the camera
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -16,11 +16,13 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
+from mujoco.batch import Batch
 
 from mjlab.sim.engine import (
     BACKGROUND,
     LENS_FIELDS,
     CameraView,
+    Engine,
     Images,
     far_limit,
     rendered_geoms,
@@ -46,6 +48,8 @@ from mjlab.utils.lab_api.math import matrix_from_quat, quat_conjugate, quat_from
 _RAYS_AT_A_TIME = 131_072
 _GEOM_TYPE = int(mujoco.mjtObj.mjOBJ_GEOM)
 
+MakeBatch = Callable[..., Batch]
+"""`make_batch(model, count)` makes a batch of simulations; `num_threads=` is optional."""
 ReadField = Callable[[str], torch.Tensor]
 """A field of `MjData` or `MjModel` by name, of n environments: (n, ...), (1, ...) if they share it."""
 
@@ -54,28 +58,15 @@ class NativeRenderer:
     """Renderer of a native engine's cameras, on threads that share out the environments."""
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        num_envs: int,
-        num_threads: int,
-        make_batch: Callable[..., Any],
-        data_field: ReadField,
-        expanded: Mapping[str, torch.Tensor],
+        self, engine: Engine, model: mujoco.MjModel, num_threads: int, make_batch: MakeBatch
     ) -> None:
-        """Render `num_envs` environments.
+        """Render the environments of `engine`, which runs `model`.
 
-        Args:
-            model: The compiled model.
-            num_envs: Number of environments N.
-            num_threads: Number of threads. Images do not depend on it.
-            make_batch: `make_batch(model, count, num_threads)` makes a batch of simulations.
-            data_field: Returns a field of `MjData` by name, (N, ...).
-            expanded: The fields of `MjModel` that differ between environments, (N, ...).
+        Images do not depend on `num_threads`.
         """
-        self._model, self._num_envs = model, num_envs
-        self._num_workers = min(num_threads, num_envs)
+        self._engine, self._model = engine, model
+        self._num_workers = min(num_threads, engine.num_envs)
         self._make_batch = partial(make_batch, num_threads=num_threads // self._num_workers)
-        self._data_field, self._expanded = data_field, expanded
         self._shared: dict[str, torch.Tensor] = {}
         self._views: dict[CameraView, list[_View]] = {}
         self._pool = ThreadPoolExecutor(self._num_workers, "render")
@@ -84,9 +75,9 @@ class NativeRenderer:
         """Render views at the poses that derived fields have; see `Engine.render`."""
         # A field that is bound for the first time makes the engine compute it, here and now.
         for name in ("xpos", "xquat", "cam_xpos", "cam_xmat"):
-            self._data_field(name)
+            self._engine.data_field(name)
         for name in ("light_xpos", "light_xdir") if self._model.nlight else ():
-            self._data_field(name)
+            self._engine.data_field(name)
         # Threads of torch, which wait for each other by spinning, would be in the way.
         threads, default = torch.get_num_threads(), torch.get_default_dtype()
         torch.set_num_threads(1)
@@ -109,8 +100,8 @@ class NativeRenderer:
         """Return what renders a view, one for each thread, into the same images."""
         if view not in self._views:
             with torch.inference_mode(False):
-                images = Images.empty(view, self._num_envs, "cpu")
-            share = -(-self._num_envs // self._num_workers)
+                images = Images.empty(view, self._engine.num_envs, "cpu")
+            share = -(-self._engine.num_envs // self._num_workers)
             self._views[view] = [
                 _View(self._model, view, images, share, self._make_batch)
                 for _ in range(self._num_workers)
@@ -120,19 +111,19 @@ class NativeRenderer:
     def _work(self, view: _View, number: int) -> None:
         """Render the share of worker `number`."""
         torch.set_num_threads(1)
-        lens_varies = not LENS_FIELDS.isdisjoint(self._expanded)
-        step = view.envs_at_a_time
+        lens_varies = not LENS_FIELDS.isdisjoint(self._engine.model_fields)
+        num_envs, step = self._engine.num_envs, view.envs_at_a_time
         # Tensors that are made here are written into in later calls, in whatever mode.
         with torch.inference_mode(False), torch.no_grad():
-            for start in range(number * step, self._num_envs, self._num_workers * step):
-                envs = slice(start, min(start + step, self._num_envs))
+            for start in range(number * step, num_envs, self._num_workers * step):
+                envs = slice(start, min(start + step, num_envs))
                 view.render(envs, partial(self._read, envs), lens_varies)
 
     def _read(self, envs: slice, name: str) -> torch.Tensor:
-        if name in self._expanded:
-            return self._expanded[name][envs]
+        if name in self._engine.model_fields:
+            return self._engine.model_fields[name][envs]
         if not hasattr(self._model, name):
-            return self._data_field(name)[envs]
+            return self._engine.data_field(name)[envs]
         if name not in self._shared:
             values = torch.tensor(getattr(self._model, name)[None])
             self._shared[name] = values.float() if values.is_floating_point() else values
@@ -202,7 +193,7 @@ class _View:
         view: CameraView,
         images: Images,
         num_envs: int,
-        make_batch: Callable[[mujoco.MjModel, int], Any],
+        make_batch: MakeBatch,
     ) -> None:
         """Prepare to render into `images`, at most `num_envs` environments at a time."""
         self.images = images
@@ -240,13 +231,13 @@ class _View:
             self._aimed = rays
             slots.aim(rays.directions, rays.origins)
         passed = self._passed(geoms, slots) if self._has_backs else None
-        slots.cast(rows, passed)
-        distances = torch.from_numpy(slots.hits.distances[:rows]).view(n, -1)
+        hits = slots.cast(rows, passed)
+        distances = torch.from_numpy(hits.distances).view(n, -1)
         depth = -distances * rays.directions[..., 2]
         missed = ~((depth >= 0.0) & (depth <= self._far))
         if images.depth is not None:
             lens.copy_to_image(depth.masked_fill(missed, 0.0)[..., None], images.depth[envs])
-        columns = slots.columns(slice(rows), slots.hits.geoms[:rows]).view(n, -1)
+        columns = slots.columns(slice(rows), hits.geoms).view(n, -1)
         columns.masked_fill_(missed, len(self._ids) - 1)
         if images.segmentation is not None:
             ids = self._ids[columns].int()
@@ -257,7 +248,7 @@ class _View:
             points = directions * distances
             if rays.origins is not None:
                 points += rays.origins.permute(2, 0, 1)
-            normals = torch.from_numpy(slots.hits.normals[:rows]).view(n, -1, 3).permute(2, 0, 1)
+            normals = torch.from_numpy(hits.normals).view(n, -1, 3).permute(2, 0, 1)
             met = Surfaces(directions, points, normals.contiguous(), columns)
             shadow = self._shadow_slots and self._shadow_of(geoms, self._shadow_slots)
             rgb = self._shading.shade(met, geoms, pos, mat, read, shadow)
@@ -292,8 +283,7 @@ class _View:
             origins: torch.Tensor, directions: torch.Tensor, limit: torch.Tensor
         ) -> torch.Tensor:
             slots.aim(directions.permute(1, 2, 0), origins.permute(1, 2, 0))
-            slots.cast(n, passed)
-            distances = torch.from_numpy(slots.hits.distances[:n])
+            distances = torch.from_numpy(slots.cast(n, passed).distances)
             return (distances >= 0.0) & (distances < limit)
 
         return shadow
@@ -525,20 +515,15 @@ class _Slots:
         self,
         model: mujoco.MjModel,
         kinds: torch.Tensor,
-        make_batch: Callable[[mujoco.MjModel, int], Any],
+        make_batch: MakeBatch,
         rows: int,
         rays: int,
     ) -> None:
-        """Prepare `rows` simulations for `rays` rays each, against geoms of types `kinds` (G,).
-
-        `make_batch(model, count)` makes a batch of simulations.
-        """
+        """Prepare `rows` simulations for `rays` rays each, against geoms of types `kinds` (G,)."""
         self._model, self._kinds, self._make_batch = model, kinds, make_batch
         self.num_rows, self._width = rows, 0
         # In double precision, as the batch wants them.
         self._origins, self._directions = np.zeros((rows, rays, 3)), np.zeros((rows, rays, 3))
-        self.hits = Hits.empty(rows, rays)
-        """Hits of the rays; geom ids are slots."""
 
     def load(self, geoms: Geoms, in_sight: torch.Tensor) -> None:
         """Put into each row the geoms that are in its sight: (rows, G) bool, rows by environment.
@@ -586,12 +571,13 @@ class _Slots:
                 by_env = torch.from_numpy(target).view(-1, *source.shape[1:])
                 by_env[: n if n > 1 else None] = source
 
-    def cast(self, rows: int, passed: Passed | None) -> None:
-        """Cast the rays of the first `rows` simulations; `passed` says which hits do not count."""
-        ids = None if rows == self.num_rows else np.arange(rows)
-        cast_through(
-            self._batch, self._origins, self._directions, self.hits, passed, ids, geomgroup=_MASK
-        )
+    def cast(self, rows: int, passed: Passed | None) -> Hits:
+        """Cast the rays of the first `rows` simulations; geom ids of hits are slots.
+
+        `passed` says which hits do not count.
+        """
+        origins, directions = self._origins[:rows], self._directions[:rows]
+        return cast_through(self._batch, origins, directions, passed, geomgroup=_MASK)
 
     def columns(self, rows: Any, slots: np.ndarray) -> torch.Tensor:
         """Return the numbers of the geoms in `slots` (m, rays) of some rows; G for -1."""

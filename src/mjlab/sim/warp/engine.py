@@ -47,7 +47,7 @@ from mjlab.utils.string import name_list
 
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
-    from mjlab.sim.engine import CameraView, Images
+    from mjlab.sim.engine import CameraView, Images, RayHits, RayQuery
     from mjlab.sim.randomization import VariantValues
 
 logger = logging.getLogger(__name__)
@@ -519,22 +519,13 @@ class WarpEngine(Engine):
 
     # Queries.
 
-    def raycast(
-        self,
-        origins: torch.Tensor,
-        directions: torch.Tensor,
-        geom_groups: tuple[int, ...] | None,
-        exclude_body_ids: torch.Tensor | None,
-        max_distances: torch.Tensor | None = None,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def raycast(self, query: RayQuery) -> RayHits:
         if self.capabilities.raycast_problem is not None:
             raise UnsupportedByWarpError(self.capabilities.raycast_problem)
-        distances, normals, geom_ids = self._rays.cast(
-            origins, directions, geom_groups, exclude_body_ids
-        )
+        distances, normals, geom_ids = self._rays.cast(query)
         missed = distances < 0.0
-        if max_distances is not None:
-            missed = missed | (distances > max_distances)
+        if query.max_distances is not None:
+            missed = missed | (distances > query.max_distances)
         return (
             distances.masked_fill(missed, -1.0),
             normals.masked_fill(missed[..., None], 0.0),

@@ -16,6 +16,7 @@ import warp
 from mjlab.sim.engine import NUM_GEOM_GROUPS, rendered_geoms
 
 if TYPE_CHECKING:
+    from mjlab.sim.engine import RayHits, RayQuery
     from mjlab.sim.warp.engine import WarpEngine
 
 # A type checker cannot follow how these two packages annotate their arrays.
@@ -28,64 +29,55 @@ class WarpRays:
 
     def __init__(self, engine: WarpEngine) -> None:
         self._engine = engine
-        self._queries: dict[Any, _Query] = {}
+        self._buffers: dict[Any, _Buffers] = {}
 
-    def cast(
-        self,
-        origins: torch.Tensor,
-        directions: torch.Tensor,
-        geom_groups: tuple[int, ...] | None,
-        exclude_body_ids: torch.Tensor | None,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return distances (N, R), normals (N, R, 3) and geom ids (N, R) at the current poses.
+    def cast(self, query: RayQuery) -> RayHits:
+        """Return distances, normals and geom ids at the current poses; those of misses are any.
 
         They are overwritten by the next call with as many rays into the same groups.
         """
-        key = (geom_groups, origins.shape[1])
-        if key not in self._queries:
+        key = (query.geom_groups, query.origins.shape[1])
+        if key not in self._buffers:
             model = self._engine.mj_model
-            groups = tuple(range(NUM_GEOM_GROUPS)) if geom_groups is None else geom_groups
+            groups = range(NUM_GEOM_GROUPS) if query.geom_groups is None else query.geom_groups
             present = {int(model.geom_group[geom]) for geom in rendered_geoms(model, groups)}
-            self._queries[key] = _Query(origins, sorted(present))
-        query = self._queries[key]
-        query.origins.copy_(origins)
-        query.directions.copy_(directions)
-        if exclude_body_ids is None:
-            query.excluded.fill_(-1)
-        else:
-            query.excluded.copy_(exclude_body_ids)
-        if query.groups:
-            self._engine.launch(f"rays {key}", lambda: self._run(query), on_cpu=False)
-        return query.distances, query.normals, query.geom_ids
+            self._buffers[key] = _Buffers(query.origins, sorted(present))
+        buffers = self._buffers[key]
+        buffers.origins.copy_(query.origins)
+        buffers.directions.copy_(query.directions)
+        buffers.excluded[:] = -1 if query.exclude_body_ids is None else query.exclude_body_ids
+        if buffers.groups:
+            self._engine.launch(f"rays {key}", lambda: self._run(buffers), on_cpu=False)
+        return buffers.distances, buffers.normals, buffers.geom_ids
 
-    def _run(self, query: _Query) -> None:
+    def _run(self, buffers: _Buffers) -> None:
         model, data = self._engine.wp_model, self._engine.wp_data
-        if query.context is None:
-            query.context = mjwarp.create_render_context(
+        if buffers.context is None:
+            buffers.context = mjwarp.create_render_context(
                 self._engine.mj_model,
                 data.nworld,
                 cam_active=[],
                 use_textures=False,
-                enabled_geom_groups=query.groups,
+                enabled_geom_groups=buffers.groups,
             )
-        mjwarp.refit_bvh(model, data, query.context)
+        mjwarp.refit_bvh(model, data, buffers.context)
         mjwarp.rays(
             model,
             data,
-            wp.from_torch(query.origins, dtype=wp.vec3),
-            wp.from_torch(query.directions, dtype=wp.vec3),
+            wp.from_torch(buffers.origins, dtype=wp.vec3),
+            wp.from_torch(buffers.directions, dtype=wp.vec3),
             # The context holds the geoms of these groups and no others.
             wp.types.vector(length=6, dtype=float)(*[-1.0] * 6),
             True,
-            wp.from_torch(query.excluded),
-            wp.from_torch(query.distances),
-            wp.from_torch(query.geom_ids),
-            wp.from_torch(query.normals, dtype=wp.vec3),
-            query.context,
+            wp.from_torch(buffers.excluded),
+            wp.from_torch(buffers.distances),
+            wp.from_torch(buffers.geom_ids),
+            wp.from_torch(buffers.normals, dtype=wp.vec3),
+            buffers.context,
         )
 
 
-class _Query:
+class _Buffers:
     """Memory of R rays in each of N worlds, at the addresses that a graph was captured with."""
 
     @torch.inference_mode(False)
