@@ -23,6 +23,11 @@ if TYPE_CHECKING:
 Stage = Literal["pos", "vel", "acc"]
 """Last stage of a forward pass: positions; positions and velocities; everything."""
 
+STAGES = {
+    name: int(getattr(mujoco.mjtStage, f"mjSTAGE_{name.upper()}")) for name in get_args(Stage)
+}
+"""MuJoCo's numbers of stages."""
+
 # Fields that MuJoCo stores as nine numbers in a row and that cross the seam as 3 x 3 matrices.
 ROTATION_MATRICES = frozenset({"xmat", "ximat", "geom_xmat", "site_xmat", "cam_xmat", "cam_mat0"})
 

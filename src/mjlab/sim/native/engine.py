@@ -26,6 +26,7 @@ from mjlab.sim.engine import (
     INPUTS,
     RESULTS_ZERO_ON_RESET,
     ROTATION_MATRICES,
+    STAGES,
     VELOCITY_FIELDS,
     Capabilities,
     Engine,
@@ -83,10 +84,6 @@ _BOUNDED = (
 )
 _BOUNDING_VOLUMES = ("bvh_aabb", "body_margin")
 
-_STAGES = {
-    name: int(getattr(mujoco.mjtStage, f"mjSTAGE_{name.upper()}")) for name in ("pos", "vel", "acc")
-}
-
 # Positions and velocities need no contacts, whose search is half of the cost of these stages on Go1
 # and G1.
 _WITHOUT_CONSTRAINTS = int(
@@ -136,7 +133,7 @@ class NativeEngine(Engine):
         stages = np.repeat(self._model.sensor_needstage, self._model.sensor_dim)
         self._sensor_columns = {
             name: None if (stages <= value).all() else torch.from_numpy(stages <= value)
-            for name, value in _STAGES.items()
+            for name, value in STAGES.items()
         }
         self._frame_marks: dict[str, np.ndarray] = {}
         self._bounds: Batch | None = None
@@ -203,7 +200,7 @@ class NativeEngine(Engine):
             # Sensors are of several stages; those of the last overwrite the others.
             if chosen.any() and (stage == "acc" or name == "sensordata"):
                 rows = torch.from_numpy(np.flatnonzero(chosen))
-                self._call(self._batch.forward, rows, stage=_STAGES[stage])
+                self._call(self._batch.forward, rows, stage=STAGES[stage])
                 self._batch.state[:] = kept
                 field.copy_out(rows, self._sensor_columns[stage] if name == "sensordata" else None)
 
@@ -316,7 +313,7 @@ class NativeEngine(Engine):
         self._copy_in()
         if stage != "acc":
             self._disabled[:] |= _WITHOUT_CONSTRAINTS
-        rows = self._call(self._batch.forward, env_ids, stage=_STAGES[stage])
+        rows = self._call(self._batch.forward, env_ids, stage=STAGES[stage])
         self._disabled[:] = self._model.opt.disableflags
         if stage == "acc" and "qacc_warmstart" in self._inputs:
             self._inputs["qacc_warmstart"].copy_out(env_ids)

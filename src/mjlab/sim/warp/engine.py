@@ -14,7 +14,7 @@ import functools
 import gc
 import logging
 import os
-from collections.abc import Callable, Generator, Sequence, Set
+from collections.abc import Callable, Generator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -31,6 +31,7 @@ from mjlab.sim.engine import (
     INPUTS,
     RESULTS_ZERO_ON_RESET,
     ROTATION_MATRICES,
+    STAGES,
     ZERO_INPUTS,
     Capabilities,
     Engine,
@@ -42,7 +43,6 @@ from mjlab.sim.randomization import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
 from mjlab.sim.warp.overflow import OverflowWatch
 from mjlab.sim.warp.rays import WarpRays
 from mjlab.sim.warp.render import WarpRenderer
-from mjlab.utils.lab_api.math import matrix_from_quat, matrix_product
 from mjlab.utils.string import name_list
 
 if TYPE_CHECKING:
@@ -66,11 +66,6 @@ _OVERWRITTEN = {
     "pos": ("history", "cvel", "cdof_dot"),
     "vel": ("history", "cacc", "cfrc_int"),
     "acc": ("history",),
-}
-_STAGES = {
-    "pos": mujoco.mjtStage.mjSTAGE_POS,
-    "vel": mujoco.mjtStage.mjSTAGE_VEL,
-    "acc": mujoco.mjtStage.mjSTAGE_ACC,
 }
 # Results that MuJoCo's reset clears too. Poses and velocities keep their values until `forward`.
 _RESULTS_ZERO_ON_RESET = (*RESULTS_ZERO_ON_RESET, "energy", "ne", "nf", "nl", "nefc")
@@ -134,6 +129,7 @@ class WarpEngine(Engine):
         self._zero_invweight0 = torch.as_tensor(model.body_invweight0 == 0, device=device)
         with self.ordered():
             self._allocate(model, cfg)
+            self._unwelded = wp.ones_like(self.wp_model.body_weldid)
         cfg.apply_wp_opt(self.wp_model.opt)
         self._data_tensors: dict[str, torch.Tensor] = {}
         self.model_fields: dict[str, torch.Tensor] = {}
@@ -142,16 +138,6 @@ class WarpEngine(Engine):
         self._absent: torch.Tensor | None = None
         self._rays = WarpRays(self)
         self._renderer = WarpRenderer(self)
-        self._eq_active0 = torch.as_tensor(model.eq_active0.astype(bool), device=self.device)
-        mocap = np.flatnonzero(model.body_mocapid >= 0)
-        mocap = mocap[np.argsort(model.body_mocapid[mocap])]
-        self._mocap_bodies = torch.as_tensor(mocap, device=self.device)
-        # Geoms whose world pose MuJoCo Warp computes only once.
-        bodies = model.geom_bodyid
-        is_carried = model.body_mocapid[model.body_rootid[bodies]] >= 0
-        static = np.flatnonzero((model.body_weldid[bodies] == 0) & ~is_carried)
-        self._static_geoms = torch.as_tensor(static, device=self.device)
-        self._static_bodies = torch.as_tensor(bodies[static], device=self.device).long()
         # Columns of `sensordata` by the stage that computes them.
         stages = np.repeat(model.sensor_needstage, model.sensor_dim)
         self._sensor_stages = torch.as_tensor(stages, device=self.device)
@@ -289,7 +275,7 @@ class WarpEngine(Engine):
         arrays = [a for part in (data, data.contact, data.efc) for a in vars(part).values()]
         with _keeping([(as_torch(a), None) for a in arrays if isinstance(a, wp.array)]):
             self.launch("step", self._substep)
-            for stage in _STAGES:
+            for stage in STAGES:
                 self.launch(stage, lambda stage=stage: self._forward(stage))
 
     # Fields.
@@ -397,21 +383,16 @@ class WarpEngine(Engine):
             mjwarp.com_vel(self.wp_model, self.wp_data)
 
     def forward(self, env_ids: torch.Tensor | None, stage: Stage = "acc") -> None:
-        results = self._data_tensors.keys() - set(_STATE_FIELDS)
-        self._forward_except(self._rows_except(env_ids), stage, results)
+        self._forward_except(self._rows_except(env_ids), stage)
 
     def forward_after_reset(self, reset_ids: torch.Tensor) -> None:
         # One full pass, because a partial one costs as much as one of all.
-        self._forward_except(self._rows_except(reset_ids), "acc", ACCELERATION_FIELDS, "vel")
+        self._forward_except(self._rows_except(reset_ids), "acc", kept_from="acc")
 
     def _forward_except(
-        self,
-        others: torch.Tensor | None,
-        stage: Stage,
-        results: Set[str],
-        done: Stage | None = None,
+        self, others: torch.Tensor | None, stage: Stage, kept_from: Stage = "pos"
     ) -> None:
-        """Compute stages up to `stage`; environments `others` keep `results` and their sensors.
+        """Compute stages up to `stage`; environments `others` keep their results of some stages.
 
         Warp computes all environments and uses fields of later stages as scratch. Those get their
         values back: fields that are one substep old stay so, as on native.
@@ -419,24 +400,23 @@ class WarpEngine(Engine):
         Args:
             others: (N,) bool, or None for no environment.
             stage: Last stage.
-            results: Fields that `others` keep.
-            done: Stage up to which `others` do not keep sensors either; None keeps all of them.
+            kept_from: First stage of the results that `others` keep, "pos" (all) or "acc".
         """
+        results = ACCELERATION_FIELDS if kept_from == "acc" else self._data_tensors.keys()
         kept: list[tuple[torch.Tensor, torch.Tensor | None]] = []
         for name, tensor in self._data_tensors.items():
             if name == "sensordata":
-                mask = (self._sensor_stages > int(_STAGES[stage]))[None]
+                mask = (self._sensor_stages > STAGES[stage])[None]
                 if others is not None:
-                    late = self._sensor_stages > (int(_STAGES[done]) if done else -1)
-                    mask = mask | (others[:, None] & late)
+                    mask = mask | (others[:, None] & (self._sensor_stages >= STAGES[kept_from]))
                 kept.append((tensor, mask))
             elif name in _OVERWRITTEN[stage]:
                 kept.append((tensor, None))
-            elif others is not None and name in results:
+            elif others is not None and name in results and name not in _STATE_FIELDS:
                 kept.append((tensor, others))
         with _keeping(kept):
-            if len(self._static_geoms) and not _STATIC_POSE.isdisjoint(self.model_fields):
-                self._place_static_geoms()
+            if not _STATIC_POSE.isdisjoint(self.model_fields):
+                self.launch("kinematics", self._place_static_geoms)
             self.launch(stage, lambda: self._forward(stage))
 
     def _forward(self, stage: str) -> None:
@@ -461,14 +441,8 @@ class WarpEngine(Engine):
 
     def _place_static_geoms(self) -> None:
         """Compute the poses of geoms that are welded to the world, which Warp does only once."""
-        self.launch("kinematics", lambda: mjwarp.kinematics(self.wp_model, self.wp_data))
-        geoms, bodies = self._static_geoms, self._static_bodies
-        frames = self.data_field("xmat")[:, bodies]
-        positions = as_torch(self.wp_model.geom_pos)[:, geoms]
-        rotations = matrix_from_quat(as_torch(self.wp_model.geom_quat)[:, geoms])
-        offsets = matrix_product(frames, positions[..., None])[..., 0]
-        self.data_field("geom_xpos")[:, geoms] = self.data_field("xpos")[:, bodies] + offsets
-        self.data_field("geom_xmat")[:, geoms] = matrix_product(frames, rotations)
+        unwelded = dataclasses.replace(self.wp_model, body_weldid=self._unwelded)
+        mjwarp.kinematics(unwelded, self.wp_data)
 
     def reset(self, env_ids: torch.Tensor | None) -> None:
         # `mjwarp.reset_data` clears the contacts of all environments together with those of the
@@ -476,10 +450,11 @@ class WarpEngine(Engine):
         for name in (*ZERO_INPUTS, *_RESULTS_ZERO_ON_RESET):
             tensor = self.data_field(name)
             tensor.zero_() if env_ids is None else tensor.index_fill_(0, env_ids, 0)
-        model, mocap = self.wp_model, self._mocap_bodies
+        model = self.wp_model
+        mocap = as_torch(model.mocap_bodyid).long()
         starts = {
             "qpos": as_torch(model.qpos0),
-            "eq_active": self._eq_active0[None],
+            "eq_active": as_torch(model.eq_active0)[None],
             "mocap_pos": as_torch(model.body_pos)[:, mocap],
             "mocap_quat": as_torch(model.body_quat)[:, mocap],
         }

@@ -108,35 +108,31 @@ class _Scene:
                 self.context.has_spot_lights = True
             if "geom_dataid" in expanded:
                 self._dataid = _without_absent_meshes(host, engine.wp_model, self.context)
-        self._images = self._read_images(engine.num_envs)
-
-    def _read_images(self, num_worlds: int) -> dict[int, Images]:
-        """View the context's buffers as images. Colours are packed there, and get their own."""
-        rc = self.context
-        device = wp.device_to_torch(wp.get_device())
-        images = {i: Images.empty(view, num_worlds, device) for i, view in self.views.items()}
+        self._images = {
+            i: Images.empty(view, engine.num_envs, engine.device) for i, view in views.items()
+        }
+        # Packed colors and the images they are copied to; the other images are the context's memory.
         self._packed: list[tuple[torch.Tensor, torch.Tensor]] = []
-        if rc is None:
-            return images
-        buffers = {"rgb": rc.rgb_data, "depth": rc.depth_data, "segmentation": rc.seg_data}
-        place = dict.fromkeys(buffers, 0)
-        for i, view in self.views.items():
-            count = view.width * view.height
-            for name in view.data_types:
-                pixels = wp.to_torch(buffers[name])[:, place[name] : place[name] + count]
-                place[name] += count
-                shape = (view.height, view.width)
-                if name == "rgb":
-                    # Blue, green, red and alpha, from the first byte of each number on.
-                    parts = pixels.view(torch.uint8).view(num_worlds, count, 4).unflatten(1, shape)
-                    rgb = images[i].rgb
-                    assert rgb is not None
-                    self._packed.append((parts, rgb))
-                elif name == "depth":
-                    images[i].depth = pixels.unflatten(1, shape)[..., None]
-                else:
-                    images[i].segmentation = pixels.unflatten(1, shape)
-        return images
+        if shown:
+            for camera, images in enumerate(self._images.values()):
+                self._read_images(camera, cameras[camera], images)
+
+    def _read_images(self, camera: int, view: CameraView, images: Images) -> None:
+        """View the buffers of one of the context's cameras as images."""
+        rc = self.context
+
+        def pixels(buffer: Any, starts: Any) -> torch.Tensor:
+            rows = wp.to_torch(buffer)[:, int(starts.numpy()[camera]) :]
+            return rows[:, : view.height * view.width].unflatten(1, (view.height, view.width))
+
+        if images.rgb is not None:
+            # Blue, green, red and alpha, from the first byte of each number on.
+            packed = pixels(rc.rgb_data, rc.rgb_adr)[..., None].view(torch.uint8)
+            self._packed.append((packed[..., :3], images.rgb))
+        if images.depth is not None:
+            images.depth = pixels(rc.depth_data, rc.depth_adr)[..., None]
+        if images.segmentation is not None:
+            images.segmentation = pixels(rc.seg_data, rc.seg_adr)
 
     def render(self) -> dict[int, Images]:
         """Render all views at the current poses."""
@@ -151,9 +147,8 @@ class _Scene:
             mjwarp.render(model, data, self.context)
 
         self._engine.launch(self._name, work, on_cpu=False)
-        for parts, rgb in self._packed:
-            for channel in range(3):
-                rgb[..., channel] = parts[..., 2 - channel]
+        for packed, rgb in self._packed:
+            rgb.copy_(packed.flip(-1))
         return self._images
 
 
