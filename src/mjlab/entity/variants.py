@@ -38,7 +38,7 @@ from mjlab.sim.randomization import (
     put_variant_model,
 )
 from mjlab.sim.randomization import VARIANT_DEPENDENT_FIELDS as VARIANT_DEPENDENT_FIELDS
-from mjlab.utils.spec import compile_composed
+from mjlab.utils.spec import compile_composed, compile_spec
 
 InertialMode = Literal["mesh-derived", "diagonal", "fullinertia"]
 """Source of a body's inertia: its geoms, `diaginertia` or `fullinertia`."""
@@ -318,8 +318,6 @@ def build_variant_model(
     Raises:
         ValueError: the spec does not compile, with MuJoCo's message.
     """
-    from mjlab.sim.simulation import compile_spec
-
     model = compile_spec(spec)
     if configure_model is not None:
         configure_model(model)

@@ -13,27 +13,17 @@ import warnings
 from dataclasses import dataclass
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from mjlab.entity.options import BIT_FIELDS, EntityOptions, write_option
 from mjlab.sim.config import MujocoCfg
+from mjlab.utils.mujoco import OPTION_ENUMS, flag_names
 
 logger = logging.getLogger(__name__)
 
 _DECIDED = frozenset(field.name for field in dataclasses.fields(MujocoCfg)) - set(BIT_FIELDS)
 
-# Options that MujocoCfg gives by the name of a member of an enum.
-_ENUMS = {
-    "integrator": (mujoco.mjtIntegrator, "mjINT_"),
-    "cone": (mujoco.mjtCone, "mjCONE_"),
-    "jacobian": (mujoco.mjtJacobian, "mjJAC_"),
-    "solver": (mujoco.mjtSolver, "mjSOL_"),
-}
-_FLAG_ENUMS = {
-    "disableflags": (mujoco.mjtDisableBit, "mjDSBL_"),
-    "enableflags": (mujoco.mjtEnableBit, "mjENBL_"),
-}
+_FLAGS = ("disableflags", "enableflags")
 
 
 @dataclass(frozen=True)
@@ -142,19 +132,23 @@ def report_overruled(
         for name, value in options.values.items():
             if name in _DECIDED and not _same(getattr(cfg, name), _config_value(name, value)):
                 _report(source, name, getattr(cfg, name), _config_value(name, value))
-        for name in _FLAG_ENUMS:
+        for name in _FLAGS:
             bits, known = options.switches.get(name, (0, 0))
-            current, cleared = tuple(getattr(cfg, name)), _flags(name, known & ~bits)
+            current, cleared = tuple(getattr(cfg, name)), flag_names(name, known & ~bits)
             kept = tuple(flag for flag in current if flag not in cleared)
             if kept != current:
                 _report(source, name, current, kept)
-    for name in (name for name in _FLAG_ENUMS if name in requests):
+    for name in (name for name in _FLAGS if name in requests):
         current = tuple(getattr(cfg, name))
-        added = tuple(flag for flag in _flags(name, requests[name].value) if flag not in current)
+        added = tuple(
+            flag for flag in flag_names(name, requests[name].value) if flag not in current
+        )
         if added:
             sources = [f"the XML of {entity!r}" for entity in requests[name].entities]
             adding = [
-                s for s in sources if set(_flags(name, stated[s].switches[name][0])) & set(added)
+                s
+                for s in sources
+                if set(flag_names(name, stated[s].switches[name][0])) & set(added)
             ]
             logger.warning(
                 "Option %s is %r, from MujocoCfg, plus %r, from %s, which applies to the whole "
@@ -172,23 +166,14 @@ def _report(source: str, name: str, current: Any, wanted: Any) -> None:
 
 def show(name: str, value: Any) -> str:
     """Return an option's value as people write it."""
-    return str(_flags(name, value) if name in _FLAG_ENUMS else _config_value(name, value))
-
-
-def _flags(name: str, bits: int) -> list[str]:
-    enum, prefix = _FLAG_ENUMS[name]
-    return [
-        member.removeprefix(prefix).lower()
-        for member, bit in enum.__members__.items()
-        if member.startswith(prefix) and int(bits) & int(bit)
-    ]
+    return str(flag_names(name, value) if name in _FLAGS else _config_value(name, value))
 
 
 def _config_value(name: str, value: Any) -> Any:
     """Return MuJoCo's value of an option as `MujocoCfg` gives it."""
-    if name not in _ENUMS:
+    if name not in OPTION_ENUMS:
         return tuple(value) if isinstance(value, np.ndarray) else value
-    enum, prefix = _ENUMS[name]
+    enum, prefix = OPTION_ENUMS[name]
     return enum(int(value)).name.removeprefix(prefix).lower()
 
 

@@ -11,16 +11,6 @@ from mjlab.utils.nan_guard import NanGuardCfg
 if TYPE_CHECKING:
     import mujoco
 
-# Options whose values are names of members of a MuJoCo enum, with the prefix of the members.
-_ENUMS = {
-    "jacobian": ("mjtJacobian", "mjJAC_"),
-    "cone": ("mjtCone", "mjCONE_"),
-    "integrator": ("mjtIntegrator", "mjINT_"),
-    "solver": ("mjtSolver", "mjSOL_"),
-    "disableflags": ("mjtDisableBit", "mjDSBL_"),
-    "enableflags": ("mjtEnableBit", "mjENBL_"),
-}
-
 
 @accepts_older_fields
 @dataclass
@@ -64,36 +54,38 @@ class MujocoCfg:
         Raises:
             ValueError: an option or flag that MuJoCo does not know, with those it does.
         """
-        import mujoco
+        from mjlab.utils.mujoco import OPTION_ENUMS
 
         for option in fields(MujocoCfg):
             name, value = option.name, getattr(self, option.name)
-            if name in _ENUMS:
-                enum_name, prefix = _ENUMS[name]
-                enum = getattr(mujoco, enum_name)
-                if name.endswith("flags"):
-                    bits = getattr(model.opt, name)
-                    for flag in value:
-                        if name == "disableflags" or flag not in ALWAYS_ENABLED_FLAGS:
-                            bits |= _enum_value(f"MujocoCfg.{name}", enum, flag, prefix)
-                    value = bits
-                else:
-                    value = _enum_value(f"MujocoCfg.{name}", enum, value, prefix)
+            if name == "enableflags":
+                value = tuple(flag for flag in value if flag not in ALWAYS_ENABLED_FLAGS)
+            if name in OPTION_ENUMS:
+                value = _enum_value(f"MujocoCfg.{name}", value, *OPTION_ENUMS[name])
+            if name.endswith("flags"):
+                value |= getattr(model.opt, name)
             setattr(model.opt, name, value)
 
 
-def _enum_value(option: str, enum: Any, name: str, prefix: str = "") -> Any:
-    """Return an enum's member for a lower-case name, or raise listing the valid names."""
+def _enum_value(option: str, value: str | tuple[str, ...], enum: Any, prefix: str = "") -> int:
+    """Return an enum's member for a lower-case name, or the bits of several names.
+
+    Raises:
+        ValueError: an unknown name, with the valid ones.
+    """
     members = {
         member[len(prefix) :].lower(): value
         for member, value in enum.__members__.items()
         if member.startswith(prefix)
     }
-    if name not in members:
-        raise ValueError(
-            f"{option}: {name!r} is not known to MuJoCo. Choose from: {', '.join(members)}."
-        )
-    return members[name]
+    bits = 0
+    for name in (value,) if isinstance(value, str) else value:
+        if name not in members:
+            raise ValueError(
+                f"{option}: {name!r} is not known to MuJoCo. Choose from: {', '.join(members)}."
+            )
+        bits |= int(members[name])
+    return bits
 
 
 @dataclass(kw_only=True)
@@ -134,13 +126,7 @@ class SimulationCfg:
                 stacklevel=2,
             )
         wp_opt.contact_sensor_maxmatch = self.contact_sensor_maxmatch
-        if self.broadphase is not None:
-            kinds = type(wp_opt.broadphase)
-            wp_opt.broadphase = _enum_value("SimulationCfg.broadphase", kinds, self.broadphase)
-        if self.broadphase_filter is not None:
-            bits = type(wp_opt.broadphase_filter)
-            wp_opt.broadphase_filter = bits(0)
-            for name in self.broadphase_filter:
-                wp_opt.broadphase_filter |= _enum_value(
-                    "SimulationCfg.broadphase_filter", bits, name
-                )
+        for name in ("broadphase", "broadphase_filter"):
+            value, enum = getattr(self, name), type(getattr(wp_opt, name))
+            if value is not None:
+                setattr(wp_opt, name, enum(_enum_value(f"SimulationCfg.{name}", value, enum)))

@@ -27,7 +27,7 @@ from mjlab.sim.engine import (
 )
 from mjlab.sim.randomization import RecomputeLevel, VariantInfo, VariantValues, is_structure
 from mjlab.utils.nan_guard import NanGuard
-from mjlab.utils.spec import compile_composed
+from mjlab.utils.spec import compile_spec
 
 logger = logging.getLogger(__name__)
 
@@ -542,19 +542,3 @@ def _reshape_rows(field: str, tensor: torch.Tensor) -> torch.Tensor:
     shape = _ROW_SHAPES.get(field)
     is_flat = shape is not None and tensor.shape[-1] == math.prod(shape)
     return tensor.unflatten(-1, shape) if is_flat else tensor
-
-
-def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile `spec` so that inertial frames may differ between environments afterwards.
-
-    Raises:
-        ValueError: the spec does not compile, with MuJoCo's message.
-    """
-    for body in spec.bodies:
-        # The compiler's shortcut for free bodies fixes the sparsity of the mass matrix, which a
-        # randomized centre of mass would need in full.
-        body.simple = 0
-    try:
-        return compile_composed(spec)
-    except ValueError as error:
-        raise ValueError(f"The scene does not compile: {error}") from error

@@ -1,4 +1,4 @@
-"""Facts about elements of a MuJoCo spec: widths of joints, kinds and controls of actuators."""
+"""Facts about MuJoCo's elements and options: widths of joints, kinds of actuators, enum names."""
 
 from __future__ import annotations
 
@@ -20,6 +20,26 @@ _WIDTHS = {
     int(_SLIDE): (1, 1),
     int(_HINGE): (1, 1),
 }
+
+OPTION_ENUMS = {
+    "jacobian": (mujoco.mjtJacobian, "mjJAC_"),
+    "cone": (mujoco.mjtCone, "mjCONE_"),
+    "integrator": (mujoco.mjtIntegrator, "mjINT_"),
+    "solver": (mujoco.mjtSolver, "mjSOL_"),
+    "disableflags": (mujoco.mjtDisableBit, "mjDSBL_"),
+    "enableflags": (mujoco.mjtEnableBit, "mjENBL_"),
+}
+"""Options whose values are members of an enum (flags: bits), with the prefix of the members."""
+
+
+def flag_names(option: str, bits: int) -> list[str]:
+    """Return the lower-case names of the bits that are set in `disableflags` or `enableflags`."""
+    enum, prefix = OPTION_ENUMS[option]
+    return [
+        member.removeprefix(prefix).lower()
+        for member, bit in enum.__members__.items()
+        if member.startswith(prefix) and int(bits) & int(bit)
+    ]
 
 
 def qpos_width(joint_type: int | mujoco.mjtJoint) -> int:

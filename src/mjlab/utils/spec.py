@@ -61,6 +61,22 @@ def compile_composed(spec: mujoco.MjSpec) -> mujoco.MjModel:
         return spec.compile()
 
 
+def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile `spec` so that inertial frames may differ between environments afterwards.
+
+    Raises:
+        ValueError: the spec does not compile, with MuJoCo's message.
+    """
+    for body in spec.bodies:
+        # The compiler's shortcut for free bodies fixes the sparsity of the mass matrix, which a
+        # randomized centre of mass would need in full.
+        body.simple = 0
+    try:
+        return compile_composed(spec)
+    except ValueError as error:
+        raise ValueError(f"The scene does not compile: {error}") from error
+
+
 def get_free_joint(spec: mujoco.MjSpec) -> mujoco.MjsJoint | None:
     """Return the first free joint of the spec, or None."""
     return next((joint for joint in spec.joints if _is_free(joint)), None)

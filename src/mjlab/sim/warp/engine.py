@@ -43,6 +43,7 @@ from mjlab.sim.randomization import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
 from mjlab.sim.warp.overflow import OverflowWatch
 from mjlab.sim.warp.rays import WarpRays
 from mjlab.sim.warp.render import WarpRenderer
+from mjlab.utils.mujoco import flag_names
 from mjlab.utils.string import name_list
 
 if TYPE_CHECKING:
@@ -587,18 +588,13 @@ def refuse_unsupported(model: mujoco.MjModel) -> None:
         if len(ids):
             names = [model.actuator(i).name or f"(id {i})" for i in ids]
             problems.append(f"the <{element}> actuators {names}; use {instead} instead")
-    for kind, known, bits in (
-        ("disable", mjwarp.DisableBit, mujoco.mjtDisableBit),
-        ("enable", mjwarp.EnableBit, mujoco.mjtEnableBit),
-    ):
+    for kind, known in (("disable", mjwarp.DisableBit), ("enable", mjwarp.EnableBit)):
+        option = f"{kind}flags"
         # Which environments sleep is no part of the state that is reset and saved here.
         supported = sum(int(bit) for bit in known if bit.name != "SLEEP")
-        flags = getattr(model.opt, f"{kind}flags") & ~supported
         problems += [
-            f"the {kind} flag {name[7:].lower()!r}; leave it out of MujocoCfg.{kind}flags and of "
-            "the XML"
-            for name, bit in bits.__members__.items()
-            if not name.startswith("mjN") and flags & int(bit)
+            f"the {kind} flag {flag!r}; leave it out of MujocoCfg.{option} and of the XML"
+            for flag in flag_names(option, getattr(model.opt, option) & ~supported)
         ]
     if problems:
         raise UnsupportedByWarpError(
