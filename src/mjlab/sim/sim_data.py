@@ -1,11 +1,12 @@
-"""Warp arrays as torch tensors, for packages that work with MuJoCo Warp's own structs.
+"""Namespaces of fields: `sim.data` and `sim.model`, and MuJoCo Warp's own structs.
 
-`sim.data` and `sim.model` are plain torch tensors and need none of this. These names are for code
-that holds a Warp array or struct of its own, such as `sim.wp_data`. Importing this loads no Warp.
+The fields of `sim.data` and `sim.model` are plain torch tensors. `TorchArray` and `WarpBridge` are
+for code that holds a Warp array or struct, such as `sim.wp_data`. Importing this loads no Warp.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -58,46 +59,70 @@ class TorchArray(torch.Tensor):
         super().__setitem__(idx, value)
 
 
-class WarpBridge(Generic[T]):
+class FieldView:
+    """Read-only namespace over the fields of `data`, `model` or `model.opt`.
+
+    A field is looked up once and then held as a plain attribute, so that reading it again costs
+    nothing. Write into the tensors in place (`data.qpos[ids] = ...`).
+    """
+
+    def __init__(self, lookup: Callable[[str], Any], nworld: int | None, owner: str) -> None:
+        self.__dict__.update(_lookup=lookup, nworld=nworld, _owner=owner)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        value = self.__dict__["_lookup"](name)
+        self.__dict__[name] = value
+        return value
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # `data.qpos += 1` writes in place and then assigns the tensor to itself.
+        if value is self.__dict__.get(name):
+            return
+        raise AttributeError(
+            f"{self._owner}.{name} cannot be replaced; write into it in place: "
+            f"{self._owner}.{name}[:] = ..."
+        )
+
+    def forget(self, names: Iterable[str]) -> None:
+        """Drop held fields, so that the next access looks them up again."""
+        for name in names:
+            self.__dict__.pop(name, None)
+
+
+class WarpBridge(FieldView, Generic[T]):
     """A Warp struct whose array attributes read as `TorchArray`s; the rest reads as it is.
 
     Attributes cannot be replaced; write into them in place.
     """
 
     def __init__(self, struct: T, nworld: int | None = None) -> None:
-        self.__dict__.update(_struct=struct, _nworld=nworld, _cache={})
+        nworld = getattr(struct, "nworld", None) if nworld is None else nworld
+        super().__init__(self._wrap, nworld, type(struct).__name__)
+        self.__dict__["_struct"] = struct
 
     @property
     def struct(self) -> T:
         """The wrapped struct."""
         return self.__dict__["_struct"]
 
-    @property
-    def nworld(self) -> int | None:
-        """Number of worlds, as given or as the struct says."""
-        given = self.__dict__["_nworld"]
-        return getattr(self.struct, "nworld", None) if given is None else given
-
     def clear_cache(self) -> None:
         """Forget wrapped arrays; needed after an array of the struct was replaced."""
-        self.__dict__["_cache"].clear()
+        held = [name for name, value in self.__dict__.items() if isinstance(value, TorchArray)]
+        self.forget(held)
+
+    def _wrap(self, name: str) -> Any:
+        value = getattr(self.struct, name)
+        if not (hasattr(value, "ptr") and hasattr(value, "dtype")):
+            return value
+        # MuJoCo Warp marks arrays whose first dimension is the worlds.
+        is_batched = getattr(value, "_is_batched", False)
+        return TorchArray(value, self.nworld if is_batched else None)
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        cache = self.__dict__["_cache"]
-        if name not in cache:
-            value = getattr(self.struct, name)
-            if not (hasattr(value, "ptr") and hasattr(value, "dtype")):
-                return value
-            # MuJoCo Warp marks arrays whose first dimension is the worlds.
-            is_batched = getattr(value, "_is_batched", False)
-            cache[name] = TorchArray(value, self.nworld if is_batched else None)
-        return cache[name]
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        # `data.qpos += 1` writes in place and then assigns the array to itself.
-        if value is not self.__dict__["_cache"].get(name):
-            raise AttributeError(
-                f"{name} cannot be replaced; write into it in place: {name}[:] = ..."
-            )
+        value = super().__getattr__(name)
+        if not isinstance(value, TorchArray):
+            # The struct may get another value.
+            self.forget([name])
+        return value

@@ -26,6 +26,7 @@ from mjlab.sim.engine import (
     resolve_engine_name,
 )
 from mjlab.sim.randomization import RecomputeLevel, VariantInfo, VariantValues, is_structure
+from mjlab.sim.sim_data import FieldView
 from mjlab.utils.nan_guard import NanGuard
 from mjlab.utils.spec import compile_spec
 
@@ -35,38 +36,6 @@ EnvIds = torch.Tensor | slice | None
 
 # Shapes of rows that MuJoCo stores flat, as MuJoCo Warp has them.
 _ROW_SHAPES = {"cam_mat0": (3, 3), "geom_aabb": (2, 3)}
-
-
-class FieldView:
-    """Read-only namespace over the fields of `data`, `model` or `model.opt`.
-
-    A field is looked up once and then held as a plain attribute, so that reading it again costs
-    nothing. Write into the tensors in place (`data.qpos[ids] = ...`).
-    """
-
-    def __init__(self, lookup: Callable[[str], Any], nworld: int, struct: str) -> None:
-        self.__dict__.update(_lookup=lookup, nworld=nworld, _struct=struct)
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        value = self.__dict__["_lookup"](name)
-        self.__dict__[name] = value
-        return value
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        # `data.qpos += 1` writes in place and then assigns the tensor to itself.
-        if value is self.__dict__.get(name):
-            return
-        raise AttributeError(
-            f"{self._struct}.{name} cannot be replaced; write into it in place: "
-            f"{self._struct}.{name}[:] = ..."
-        )
-
-    def forget(self, names: tuple[str, ...]) -> None:
-        """Drop held fields, so that the next access looks them up again."""
-        for name in names:
-            self.__dict__.pop(name, None)
 
 
 class SharedField(torch.Tensor):
