@@ -536,14 +536,9 @@ class _Slots:
         row, column = in_sight.nonzero(as_tuple=True)
         place = row * self._width + count[row, column] - 1
         flat = row.div(rows // len(geoms.pos), rounding_mode="floor") * num_geoms + column
-        for name, values in (
-            ("geom_pos", geoms.pos),
-            ("geom_quat", geoms.quat),
-            ("geom_size", geoms.size),
-            ("geom_dataid", geoms.dataid),
-        ):
-            target = self._values[name].flatten(0, 1)
-            target[place] = values.flatten(0, 1)[flat].to(target.dtype)
+        for name in ("pos", "quat", "size", "dataid"):
+            target = self._values[f"geom_{name}"].flatten(0, 1)
+            target[place] = getattr(geoms, name).flatten(0, 1)[flat].to(target.dtype)
         self._values["geom_type"].view(-1)[place] = self._kinds[column]
         self._values["geom_group"][:rows] = _EMPTY
         self._values["geom_group"].view(-1)[place] = 0
@@ -716,11 +711,7 @@ class _Shading:
         return torch.stack(rgb.mul_(255.0).to(torch.uint8).unbind(), dim=-1)
 
     def _lights(
-        self,
-        points: torch.Tensor,
-        pos: torch.Tensor,
-        mat: torch.Tensor,
-        read: ReadField,
+        self, points: torch.Tensor, pos: torch.Tensor, mat: torch.Tensor, read: ReadField
     ) -> Iterator[tuple[torch.Tensor, ...]]:
         """Yield what each light that shines somewhere is at the points (3, n, P).
 

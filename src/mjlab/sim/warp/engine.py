@@ -20,10 +20,10 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import mujoco
-import mujoco_warp
+import mujoco_warp as mjwarp
 import numpy as np
 import torch
-import warp
+import warp as wp
 
 from mjlab.sim.engine import (
     ACCELERATION_FIELDS,
@@ -52,10 +52,6 @@ if TYPE_CHECKING:
     from mjlab.sim.randomization import VariantValues
 
 logger = logging.getLogger(__name__)
-
-# A type checker cannot follow how these two packages annotate their arrays.
-mjwarp: Any = mujoco_warp
-wp: Any = warp
 
 # What the next step depends on. `reset` sets all of it, and a saved state is made of it.
 _STATE_FIELDS = (*INPUTS, "history")
@@ -289,12 +285,24 @@ class WarpEngine(Engine):
             arrays = vars(self.wp_data.contact).items()
             return SimpleNamespace(**{key: as_torch(array) for key, array in arrays})
         if name not in self._data_tensors:
-            array = find_data_field(self.wp_data, name)
+            offered = offered_data_fields(self.wp_data)
+            if name == "ncon" or name.startswith("efc"):
+                raise AttributeError(
+                    f"The warp engine does not offer MjData.{name}; read contacts by a contact "
+                    "sensor, or those of all environments together from sim.data.nacon and "
+                    "sim.data.contact."
+                )
+            if name not in offered:
+                raise AttributeError(
+                    f"The warp engine has no per-environment MjData field {name!r}. Available: "
+                    f"{name_list(sorted(offered), near=(name,))}."
+                )
             check_sensor_fed(self.mj_model, name)
             shape = getattr(getattr(self._host, name), "shape", ())
             if name in ROTATION_MATRICES:
                 shape = (*shape[:-1], 3, 3)
-            self._data_tensors[name] = as_torch(array).view(self.num_envs, *shape)
+            array = as_torch(getattr(self.wp_data, name))
+            self._data_tensors[name] = array.view(self.num_envs, *shape)
         return self._data_tensors[name]
 
     @torch.inference_mode(False)
@@ -634,26 +642,6 @@ def offered_data_fields(data: Any) -> set[str]:
     """Return the names of the `MjData` fields that every environment has."""
     fields = _fields_over(type(data), "nworld") - _UNLIKE_MUJOCO
     return {name for name in fields if hasattr(mujoco.MjData, name)}
-
-
-def find_data_field(data: Any, name: str) -> Any:
-    """Return the Warp array of an `MjData` field that every environment has.
-
-    Raises:
-        AttributeError: there is no such field; the message says what to use, or close names.
-    """
-    known = offered_data_fields(data)
-    if name in known:
-        return getattr(data, name)
-    if name == "ncon" or name.startswith("efc"):
-        raise AttributeError(
-            f"The warp engine does not offer MjData.{name}; read contacts by a contact sensor, or "
-            "those of all environments together from sim.data.nacon and sim.data.contact."
-        )
-    raise AttributeError(
-        f"The warp engine has no per-environment MjData field {name!r}. Available: "
-        f"{name_list(sorted(known), near=(name,))}."
-    )
 
 
 def find_model_field(model: Any, name: str) -> tuple[Any, str]:

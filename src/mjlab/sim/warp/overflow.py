@@ -9,16 +9,13 @@ import logging
 import math
 from typing import TYPE_CHECKING, Any
 
-import mujoco_warp
+import mujoco_warp as mjwarp
 import torch
 
 if TYPE_CHECKING:
     from mjlab.sim.warp.engine import WarpEngine
 
 logger = logging.getLogger(__name__)
-
-# A type checker cannot follow how this package annotates its arrays.
-mjwarp: Any = mujoco_warp
 
 # Dispatches of `step` between two looks at the overflow flags.
 _CHECK_PERIOD = 64
@@ -96,17 +93,13 @@ class OverflowWatch:
             message = _OTHER.get(kind.name)
             if message is None:
                 option, what = _OUTGROWN[kind.name]
-                size = self._engine.capacities[option]
-                # A quarter more than is needed now, or twice what was not enough at some time.
-                is_now = needed[option] > size
-                advised = 8 * math.ceil((1.25 * needed[option] if is_now else 2 * size) / 8)
+                size, need = self._engine.capacities[option], needed[option]
+                # Twice what was not enough at some time, or a quarter more than is needed now.
+                enough, hint = 2 * size, ", and to more if this comes again"
+                if need > size:
+                    enough, hint = 1.25 * need, f" or more ({need} are needed now)"
                 message = (
                     f"more {what} than {option}={size} per environment allows; the excess was "
-                    f"dropped. Set SimulationCfg.{option} to {advised}"
-                    + (
-                        f" or more ({needed[option]} are needed now)"
-                        if is_now
-                        else ", and to more if this comes again"
-                    )
+                    f"dropped. Set SimulationCfg.{option} to {8 * math.ceil(enough / 8)}{hint}"
                 )
             logger.warning("MuJoCo Warp overflow in some environment: %s.", message)

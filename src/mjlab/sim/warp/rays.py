@@ -9,19 +9,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import mujoco_warp
+import mujoco_warp as mjwarp
 import torch
-import warp
+import warp as wp
 
 from mjlab.sim.engine import NUM_GEOM_GROUPS, rendered_geoms
 
 if TYPE_CHECKING:
     from mjlab.sim.engine import RayHits, RayQuery
     from mjlab.sim.warp.engine import WarpEngine
-
-# A type checker cannot follow how these two packages annotate their arrays.
-mjwarp: Any = mujoco_warp
-wp: Any = warp
 
 
 class WarpRays:

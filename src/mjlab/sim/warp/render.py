@@ -7,19 +7,15 @@ import itertools
 from typing import TYPE_CHECKING, Any
 
 import mujoco
-import mujoco_warp
+import mujoco_warp as mjwarp
 import numpy as np
 import torch
-import warp
+import warp as wp
 
 from mjlab.sim.engine import LENS_FIELDS, CameraView, Images, rendered_geoms
 
 if TYPE_CHECKING:
     from mjlab.sim.warp.engine import WarpEngine
-
-# A type checker cannot follow how these two packages annotate their arrays.
-mjwarp: Any = mujoco_warp
-wp: Any = warp
 
 
 # What a context depends on besides, where environments differ in it.
@@ -71,11 +67,7 @@ class _Scene:
     """One render context, and the views that are rendered with it."""
 
     def __init__(
-        self,
-        engine: WarpEngine,
-        views: dict[int, CameraView],
-        expanded: frozenset[str],
-        name: str,
+        self, engine: WarpEngine, views: dict[int, CameraView], expanded: frozenset[str], name: str
     ) -> None:
         self.views, self.expanded = views, expanded
         self._engine, self._name = engine, name
