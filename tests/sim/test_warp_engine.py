@@ -21,12 +21,12 @@ from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg, mdp
 from mjlab.managers import EventTermCfg, SceneEntityCfg
 from mjlab.scene import SceneCfg
 from mjlab.sim.config import MujocoCfg, SimulationCfg
-from mjlab.sim.engine import Engine, EngineUnavailableError, RayQuery
+from mjlab.sim.engine import ROTATION_MATRICES, Engine, EngineUnavailableError, RayQuery
 from mjlab.sim.randomization import expand_model_fields
 from mjlab.sim.sim_data import TorchArray, WarpBridge
-from mjlab.sim.warp.engine import WarpEngine
+from mjlab.sim.warp.engine import WarpEngine, offered_data_fields
 
-from .parity_models import CARTPOLE, HINGE_CHAIN, LANDING_BOX, MOCAP
+from .parity_models import CARTPOLE, EQUALITIES, HINGE_CHAIN, LANDING_BOX, MOCAP
 
 TWO_JOINTS = """
 <mujoco>
@@ -149,6 +149,19 @@ def test_a_data_field_that_is_not_offered_says_why(field: str, said: str) -> Non
 
 
 # Fields.
+
+
+@pytest.mark.parametrize("xml", [LANDING_BOX, EQUALITIES])
+def test_every_data_field_that_is_offered_has_the_shape_that_mujoco_gives_it(xml: str) -> None:
+    engine, host = make_engine(xml, num_envs=3), mujoco.MjData(mujoco.MjModel.from_xml_string(xml))
+    mujoco.mj_forward(engine.mj_model, host)
+    for field in offered_data_fields(engine.wp_data):
+        shape = getattr(getattr(host, field), "shape", ())
+        shape = (*shape[:-1], 3, 3) if field in ROTATION_MATRICES else shape
+        try:
+            assert engine.data_field(field).shape == (3, *shape), field
+        except AttributeError as error:
+            assert "only" in str(error), "fields that the model has no sensor for"
 
 
 def test_fields_are_the_arrays_themselves() -> None:
@@ -622,11 +635,8 @@ def test_torch_computes_nothing_that_warp_reads_within_the_same_wait() -> None:
 
     engine.ordered = noted
     # Not contiguous and of other types, so that they have to be copied.
-    points = torch.zeros(3, 2).T
-    bodies = torch.tensor([[1, 0], [1, 0]])[:, 0]
     rays = torch.zeros(3, 4, 2).permute(2, 1, 0)
     with work:
-        engine.jacobian(points, bodies)
         engine.raycast(RayQuery(rays, rays - 1.0, None, torch.ones(8, dtype=torch.int64)[::2]))
         engine.step(1)
         engine.forward(torch.tensor([1]))

@@ -205,8 +205,6 @@ class Capabilities:
 
     name: str
     """`native` or `warp`."""
-    device: str
-    """Torch device on which all fields live."""
     description: str
     """One line for people: the library, its version, the device, the number of threads."""
     num_threads: int | None = None
@@ -334,22 +332,6 @@ class Engine(ABC):
 
         Returns:
             Images in the order of `views`. Their tensors may be overwritten by the next call.
-        """
-
-    @abstractmethod
-    def jacobian(
-        self, points: torch.Tensor, body_ids: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Jacobians of one world-frame point per environment, moving with a body.
-
-        They belong to the state that derived fields (`xpos`) belong to, and not to a qpos that was
-        written or stepped since.
-
-        Args:
-            points: (N, 3) metres. body_ids: (N,) int32.
-
-        Returns:
-            Translational and rotational Jacobian, each (N, 3, nv), world frame.
         """
 
     @abstractmethod

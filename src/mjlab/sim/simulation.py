@@ -27,6 +27,7 @@ from mjlab.sim.engine import (
 )
 from mjlab.sim.randomization import RecomputeLevel, VariantInfo, VariantValues, is_structure
 from mjlab.sim.sim_data import FieldView
+from mjlab.utils.mujoco import moving_dofs
 from mjlab.utils.nan_guard import NanGuard
 from mjlab.utils.spec import compile_spec
 
@@ -459,8 +460,28 @@ class Simulation:
 
         `body_ids` (N,) int32 says which body each point moves with. Like `xpos` and all derived
         fields, they belong to the state before the last substep, until `forward`.
+
+        A degree of freedom with motion axis (w, v) at the center of mass c of the body's tree moves
+        a point p with v + w x (p - c).
         """
-        return self._engine.jacobian(points, body_ids)
+        # Not `Batch.jac`, which belongs to the present qpos: in the middle of a step that is one
+        # substep newer than the positions that the points come from.
+        roots, moves = self._body_motion
+        body_ids = body_ids.long()
+        envs = torch.arange(self.num_envs, device=self.device)
+        centers = self.data.subtree_com[envs, roots[body_ids]]
+        axes = self.data.cdof * moves[body_ids][..., None]
+        rotational, translational = axes.split(3, dim=-1)
+        arms = (points - centers)[:, None].expand_as(rotational)
+        translational = translational + torch.linalg.cross(rotational, arms)
+        return translational.mT, rotational.mT
+
+    @cached_property
+    def _body_motion(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Root of each body, (nbody,), and whether it moves with a degree of freedom, (nbody, nv)."""
+        roots = torch.as_tensor(self.mj_model.body_rootid, dtype=torch.int64, device=self.device)
+        moves = torch.as_tensor(moving_dofs(self.mj_model), dtype=torch.float32, device=self.device)
+        return roots, moves
 
     def copy_to_host(self, env_idx: int, mj_data: mujoco.MjData | None = None) -> mujoco.MjData:
         """Copy the state of one environment into host data, for viewers; runs no forward pass."""

@@ -37,7 +37,6 @@ from mjlab.sim.engine import (
 from mjlab.sim.native.rays import NativeRays
 from mjlab.sim.native.render import NativeRenderer, render_problem
 from mjlab.sim.randomization import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
-from mjlab.utils.mujoco import moving_dofs
 from mjlab.utils.processes import cores_per_process
 
 if TYPE_CHECKING:
@@ -147,7 +146,6 @@ class NativeEngine(Engine):
         threads = self._batch.nthread
         self.capabilities = Capabilities(
             name="native",
-            device="cpu",
             description=(
                 f"native (MuJoCo {mujoco.__version__}), device cpu, "
                 f"{threads} physics thread{'s' if threads != 1 else ''}"
@@ -430,27 +428,6 @@ class NativeEngine(Engine):
         # nothing: 0.97 to 1.09 of the time of Go1 and G1, with 256 to 4,096 environments.
         sleeps = model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         return Batch(model, count, num_threads or self._batch.nthread, persistent=bool(sleeps))
-
-    def jacobian(
-        self, points: torch.Tensor, body_ids: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        # Not `Batch.jac`, which belongs to the present qpos: in the middle of a step that is one
-        # substep newer than the positions that the points come from.
-        axes, com = self.data_field("cdof"), self.data_field("subtree_com")
-        body_ids = body_ids.long()
-        moves = self._moving_dofs[body_ids][..., None]
-        # `cdof` is about the center of mass of the body's tree.
-        roots = torch.from_numpy(self._model.body_rootid)[body_ids].long()
-        arm = points - com[torch.arange(self.num_envs), roots]
-        rotational = axes[..., :3] * moves
-        translational = axes[..., 3:] * moves
-        translational += torch.linalg.cross(rotational, arm[:, None].expand_as(rotational))
-        return translational.mT, rotational.mT
-
-    @functools.cached_property
-    def _moving_dofs(self) -> torch.Tensor:
-        """(nbody, nv) whether a body moves with a degree of freedom."""
-        return torch.from_numpy(moving_dofs(self._model)).float()
 
     # Copies.
 

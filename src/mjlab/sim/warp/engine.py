@@ -30,7 +30,6 @@ from mjlab.sim.engine import (
     COLLISION_MASKS,
     INPUTS,
     RESULTS_ZERO_ON_RESET,
-    ROTATION_MATRICES,
     STAGES,
     ZERO_INPUTS,
     Capabilities,
@@ -56,7 +55,11 @@ logger = logging.getLogger(__name__)
 # What the next step depends on. `reset` sets all of it, and a saved state is made of it.
 _STATE_FIELDS = (*INPUTS, "history")
 # Held in another layout than MuJoCo's, or not per environment.
-_UNLIKE_MUJOCO = frozenset({"qLD", "qLDiagInv", "qLU", "solver_niter", "contact", "efc"})
+_UNLIKE_MUJOCO = frozenset(
+    {"qLD", "qLDiagInv", "qLU", "solver_niter", "contact", "efc", "flexedge_hessian"}
+    | {f"island_{name}" for name in ("dofadr", "idofadr", "iefcadr", "ne", "nf", "nefc", "nv")}
+    | {"map_efc2iefc", "map_iefc2efc"}
+)
 # What MuJoCo Warp overwrites in a stage beside its results: delay lines, which a substep alone is to
 # advance; forces of the last substep, used as scratch; velocities that constraints read.
 _OVERWRITTEN = {
@@ -153,7 +156,6 @@ class WarpEngine(Engine):
         self._overflow = OverflowWatch(self, as_torch(self.wp_data.overflow))
         self.capabilities = Capabilities(
             name="warp",
-            device=str(device),
             description=(
                 f"warp (mujoco_warp {mjwarp.__version__}, Warp {wp.config.version}), "
                 f"device {device}" + ("" if self._on_cuda else ", for testing: slow")
@@ -163,7 +165,6 @@ class WarpEngine(Engine):
         self.create_graph()
 
     def _allocate(self, model: mujoco.MjModel, cfg: SimulationCfg) -> None:
-        limits = {"nconmax": cfg.nconmax, "njmax": cfg.njmax}
         # At `qpos0` all robots are at the origin of the world, which may be deep inside a generated
         # terrain. No episode starts there, so its contacts say nothing about the sizes needed.
         if cfg.nconmax is not None and self._host.ncon > cfg.nconmax:
@@ -178,7 +179,9 @@ class WarpEngine(Engine):
             model.opt.disableflags = flags
         try:
             self.wp_model = mjwarp.put_model(model)
-            self.wp_data = mjwarp.put_data(model, self._host, self.num_envs, **limits)
+            self.wp_data = mjwarp.put_data(
+                model, self._host, self.num_envs, nconmax=cfg.nconmax, njmax=cfg.njmax
+            )
         except NotImplementedError as error:
             raise UnsupportedByWarpError(
                 f"The warp engine cannot simulate this model: {error} "
@@ -298,11 +301,7 @@ class WarpEngine(Engine):
                     f"{name_list(sorted(offered), near=(name,))}."
                 )
             check_sensor_fed(self.mj_model, name)
-            shape = getattr(getattr(self._host, name), "shape", ())
-            if name in ROTATION_MATRICES:
-                shape = (*shape[:-1], 3, 3)
-            array = as_torch(getattr(self.wp_data, name))
-            self._data_tensors[name] = array.view(self.num_envs, *shape)
+            self._data_tensors[name] = as_torch(getattr(self.wp_data, name))
         return self._data_tensors[name]
 
     @torch.inference_mode(False)
@@ -522,19 +521,6 @@ class WarpEngine(Engine):
     def render_context(self, views: tuple[CameraView, ...], view: CameraView) -> Any:
         """Return the `mujoco_warp.RenderContext` of a view, one of `views` rendered together."""
         return self._renderer.context_of(views, view)
-
-    def jacobian(
-        self, points: torch.Tensor, body_ids: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        shape = (2, self.num_envs, 3, self.mj_model.nv)
-        translational, rotational = torch.empty(shape, device=self.device)
-        # Copied before Warp's stream starts to wait for torch's, which it does only once.
-        points, body_ids = points.float().contiguous(), body_ids.to(torch.int32).contiguous()
-        with self.ordered():
-            point, body = wp.from_torch(points, dtype=wp.vec3), wp.from_torch(body_ids)
-            outputs = wp.from_torch(translational), wp.from_torch(rotational)
-            mjwarp.jac(self.wp_model, self.wp_data, *outputs, point, body)
-        return translational, rotational
 
     # Copies.
 
