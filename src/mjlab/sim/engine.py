@@ -166,16 +166,15 @@ class Images:
     @classmethod
     def empty(cls, view: CameraView, num_envs: int, device: str | torch.device) -> Images:
         """Allocate images that show nothing."""
-        shape = (num_envs, view.height, view.width)
         images = cls()
-        if "rgb" in view.data_types:
-            images.rgb = torch.zeros(*shape, 3, dtype=torch.uint8, device=device)
-        if "depth" in view.data_types:
-            images.depth = torch.zeros(*shape, 1, dtype=torch.float32, device=device)
-        if "segmentation" in view.data_types:
-            images.segmentation = torch.full(
-                (*shape, 2), BACKGROUND, dtype=torch.int32, device=device
-            )
+        for name, channels, dtype, nothing in (
+            ("rgb", 3, torch.uint8, 0),
+            ("depth", 1, torch.float32, 0),
+            ("segmentation", 2, torch.int32, BACKGROUND),
+        ):
+            if name in view.data_types:
+                shape = (num_envs, view.height, view.width, channels)
+                setattr(images, name, torch.full(shape, nothing, dtype=dtype, device=device))
         return images
 
 

@@ -40,16 +40,8 @@ CONSTANTS_AT_QPOS0 = (
 )
 
 VARIANT_DEPENDENT_FIELDS = (
-    "geom_size",
-    "geom_rbound",
-    "geom_aabb",
-    "geom_pos",
-    "geom_quat",
-    "body_mass",
-    "body_subtreemass",
-    "body_inertia",
-    "body_invweight0",
-    "body_ipos",
+    *("geom_size", "geom_rbound", "geom_aabb", "geom_pos", "geom_quat"),
+    *("body_mass", "body_subtreemass", "body_inertia", "body_invweight0", "body_ipos"),
     "body_iquat",
 )
 """Model fields that are per environment wherever an entity has variants.
@@ -123,11 +115,9 @@ class VariantInfo(Protocol):
 
     def assign_worlds(self, num_envs: int) -> np.ndarray:
         """Return the variant of each environment, (num_envs,) int."""
-        ...
 
     def columns(self, model: mujoco.MjModel) -> list[VariantColumns]:
         """Return what each variant puts into `model`; all variants name the same elements."""
-        ...
 
 
 class VariantValues:

@@ -199,7 +199,7 @@ class Simulation:
         AttributeError on another engine, RuntimeError before the first rendering.
         """
         engine = self._warp_engine("render_context", "the images of camera sensors")
-        return engine.render_context(views, view)
+        return engine.renderer.context_of(views, view)
 
     def _warp_engine(self, name: str, instead: str) -> Any:
         if self.engine_name != "warp":
@@ -334,8 +334,7 @@ class Simulation:
 
     def expand_constants(self, level: RecomputeLevel | int) -> None:
         """Expand the model fields that `recompute_constants(level)` writes."""
-        if int(level) != 0:
-            self.expand_model_fields(self._engine.constants_written_by(int(level)))
+        self.expand_model_fields(self._engine.constants_written_by(int(level)))
 
     def recompute_constants(self, level: RecomputeLevel | int, env_ids: EnvIds = None) -> None:
         """Recompute what derives from changed model fields, as `mj_setConst` does.

@@ -10,7 +10,6 @@ import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -67,24 +66,20 @@ class NativeRays:
 
     def cast(self, query: RayQuery) -> RayHits:
         """Cast rays; see `Engine.raycast`."""
-        origins, directions = query.origins.numpy(), query.directions.numpy()
-        groups, excluded = query.geom_groups, np.array([-1])
-        if query.exclude_body_ids is not None:
-            excluded = query.exclude_body_ids.numpy()
-        cast_in_batch = partial(self._cast_in_batch, origins, directions, groups, excluded)
-        table, has_others = None, True
+        directions, table, has_others = query.directions.numpy(), None, True
         # Rows are compared with rows: a last dimension of three takes ten times as long.
         if (directions == np.tile(-_UP, (directions.shape[1], 1))).all():
-            key = groups, np.unique(excluded).tobytes()
+            excluded = np.unique(_excluded(query))
+            key = query.geom_groups, excluded.tobytes()
             if key not in self._tables:
-                self._tables[key] = self._ground(groups, excluded)
+                self._tables[key] = self._ground(query.geom_groups, excluded)
             table, has_others = self._tables[key]
         if table is None or not table.is_current(self._engine.model_fields):
-            hits = cast_in_batch(static=True)
+            hits = self._cast_in_batch(query, static=True)
         else:
-            hits = table.cast(origins)
+            hits = table.cast(query.origins.numpy())
             if has_others:
-                hits.take_nearer(cast_in_batch(static=False))
+                hits.take_nearer(self._cast_in_batch(query, static=False))
         if query.max_distances is not None:
             hits.forget(hits.distances > query.max_distances.numpy())
         arrays = hits.distances, hits.normals, hits.geoms
@@ -120,17 +115,10 @@ class NativeRays:
             return None, True
         return GroundTable(model, ground, self._pos[ground], static), others
 
-    def _cast_in_batch(
-        self,
-        origins: Array,
-        directions: Array,
-        groups: tuple[int, ...] | None,
-        excluded: Array,
-        static: bool,
-    ) -> Hits:
+    def _cast_in_batch(self, query: RayQuery, static: bool) -> Hits:
         """Cast against the geoms of the model, those that never move only if `static`."""
-        n = len(origins)
-        pos, mat = (np.broadcast_to(x, (n, *x.shape)) for x in (self._pos, self._mat))
+        origins, directions = query.origins.numpy(), query.directions.numpy()
+        pos, mat = (np.broadcast_to(x, (len(origins), *x.shape)) for x in (self._pos, self._mat))
         if self._fields_are_carried:
             pos, mat = (
                 self._engine.data_field(name).numpy() for name in ("geom_xpos", "geom_xmat")
@@ -144,10 +132,15 @@ class NativeRays:
             origins,
             directions,
             passed if self._rule.is_needed else None,
-            geomgroup=_group_mask(groups),
-            bodyexclude=excluded,
+            geomgroup=_group_mask(query.geom_groups),
+            bodyexclude=_excluded(query),
             flg_static=static,
         )
+
+
+def _excluded(query: RayQuery) -> Array:
+    ids = query.exclude_body_ids
+    return np.array([-1]) if ids is None else ids.numpy()
 
 
 def _group_mask(groups: tuple[int, ...] | None) -> Array:

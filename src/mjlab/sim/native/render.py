@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 import torch
 from mujoco.batch import Batch
+from torch import Tensor
 
 from mjlab.sim.engine import (
     BACKGROUND,
@@ -50,7 +51,7 @@ _GEOM_TYPE = int(mujoco.mjtObj.mjOBJ_GEOM)
 
 MakeBatch = Callable[..., Batch]
 """`make_batch(model, count)` makes a batch of simulations; `num_threads=` is optional."""
-ReadField = Callable[[str], torch.Tensor]
+ReadField = Callable[[str], Tensor]
 """A field of `MjData` or `MjModel` by name, of n environments: (n, ...), (1, ...) if they share it."""
 
 
@@ -67,16 +68,14 @@ class NativeRenderer:
         self._engine, self._model = engine, model
         self._num_workers = min(num_threads, engine.num_envs)
         self._make_batch = partial(make_batch, num_threads=num_threads // self._num_workers)
-        self._shared: dict[str, torch.Tensor] = {}
+        self._shared: dict[str, Tensor] = {}
         self._views: dict[CameraView, list[_View]] = {}
         self._pool = ThreadPoolExecutor(self._num_workers, "render")
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:
         """Render views at the poses that derived fields have; see `Engine.render`."""
         # A field that is bound for the first time makes the engine compute it, here and now.
-        for name in ("xpos", "xquat", "cam_xpos", "cam_xmat"):
-            self._engine.data_field(name)
-        for name in ("light_xpos", "light_xdir") if self._model.nlight else ():
+        for name in ("xpos", "xquat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir"):
             self._engine.data_field(name)
         # Threads of torch, which wait for each other by spinning, would be in the way.
         threads, default = torch.get_num_threads(), torch.get_default_dtype()
@@ -119,7 +118,7 @@ class NativeRenderer:
                 envs = slice(start, min(start + step, num_envs))
                 view.render(envs, partial(self._read, envs), lens_varies)
 
-    def _read(self, envs: slice, name: str) -> torch.Tensor:
+    def _read(self, envs: slice, name: str) -> Tensor:
         if name in self._engine.model_fields:
             return self._engine.model_fields[name][envs]
         if not hasattr(self._model, name):
@@ -148,25 +147,25 @@ def render_problem(model: mujoco.MjModel) -> str | None:
 class Geoms:
     """G geoms in the frame of the camera, in n environments."""
 
-    pos: torch.Tensor
+    pos: Tensor
     """Position, (n, G, 3)."""
-    quat: torch.Tensor
+    quat: Tensor
     """Orientation, (n, G, 4)."""
-    mat: torch.Tensor
+    mat: Tensor
     """Orientation, (n, G, 3, 3)."""
-    size: torch.Tensor
+    size: Tensor
     """Size, (n, G, 3)."""
-    center: torch.Tensor
+    center: Tensor
     """Center of a box around the geom, in the frame of the geom, (n, G, 3)."""
-    half: torch.Tensor
+    half: Tensor
     """Half extents of the box, (n, G, 3)."""
-    dataid: torch.Tensor
+    dataid: Tensor
     """Height field or mesh, or -1, (n, G) int32."""
-    material: torch.Tensor
+    material: Tensor
     """Material, -1 for none, (1 or n, G)."""
-    rgba: torch.Tensor
+    rgba: Tensor
     """Color, (1 or n, G, 4)."""
-    exists: torch.Tensor
+    exists: Tensor
     """True where an environment has the geom and it is not fully transparent, (n, G) bool."""
 
 
@@ -174,13 +173,13 @@ class Geoms:
 class Surfaces:
     """Hits of n x P rays, in the camera frame."""
 
-    directions: torch.Tensor
+    directions: Tensor
     """Unit vectors along the rays, (3, 1 or n, P)."""
-    points: torch.Tensor
+    points: Tensor
     """Positions, (3, n, P)."""
-    normals: torch.Tensor
+    normals: Tensor
     """Unit normals, (3, n, P)."""
-    columns: torch.Tensor
+    columns: Tensor
     """Number of the geom among those that are rendered, (n, P); G for nothing."""
 
 
@@ -273,15 +272,13 @@ class _View:
 
         return passed
 
-    def _shadow_of(self, geoms: Geoms, slots: _Slots) -> Callable[..., torch.Tensor]:
+    def _shadow_of(self, geoms: Geoms, slots: _Slots) -> Callable[..., Tensor]:
         """Return what casts shadow rays."""
         n = len(geoms.pos)
         slots.load(geoms, geoms.exists)
         passed = self._passed(geoms, slots, is_shadow=True) if self._has_fields else None
 
-        def shadow(
-            origins: torch.Tensor, directions: torch.Tensor, limit: torch.Tensor
-        ) -> torch.Tensor:
+        def shadow(origins: Tensor, directions: Tensor, limit: Tensor) -> Tensor:
             slots.aim(directions.permute(1, 2, 0), origins.permute(1, 2, 0))
             distances = torch.from_numpy(slots.cast(n, passed).distances)
             return (distances >= 0.0) & (distances < limit)
@@ -299,14 +296,14 @@ _TILE = 8
 class _Rays:
     """Rays (n, P) of a camera, sorted into tiles; n is 1 where all environments share them."""
 
-    directions: torch.Tensor
+    directions: Tensor
     """Unit vectors, (n, P, 3)."""
-    origins: torch.Tensor | None
+    origins: Tensor | None
     """Where rays start if the projection is orthographic, (n, P, 3); None: at the camera."""
-    planes: torch.Tensor
+    planes: Tensor
     """Inward normals of the planes between which tiles are, (n, 3, F): F planes are the left sides
     of columns, the right sides, the tops of rows and the bottoms."""
-    plane_offsets: torch.Tensor
+    plane_offsets: Tensor
     """Signed distances of the camera from the planes, (n, 1, F)."""
 
 
@@ -361,7 +358,7 @@ class _Lens:
             return _Rays(directions, origins, torch.cat((normals, none), dim=1), -edges[:, None])
         return _Rays(directions, origins, torch.cat((normals, edges[:, None]), dim=1), none)
 
-    def _frustum(self, read: ReadField) -> tuple[torch.Tensor, ...]:
+    def _frustum(self, read: ReadField) -> tuple[Tensor, ...]:
         """Return the sides (n, 1) of the image: left, right, bottom, top.
 
         They are those at a distance of 1 m, unless rays are parallel.
@@ -382,7 +379,7 @@ class _Lens:
             (0.5 * height - cy) / fy,
         )
 
-    def copy_to_image(self, values: torch.Tensor, out: torch.Tensor) -> None:
+    def copy_to_image(self, values: Tensor, out: Tensor) -> None:
         """Copy values of rays (n, P, ...) to an image (n, height, width, ...)."""
         torch.index_select(values, 1, self._place, out=out.view(len(out), -1, *out.shape[3:]))
 
@@ -402,9 +399,7 @@ _SLACK, _SLACK_METRES = 1e-5, 1e-6
 class _Sight:
     """The geoms that a camera may see, and which of them are in sight of each tile."""
 
-    def __init__(
-        self, model: mujoco.MjModel, ids: torch.Tensor, kinds: torch.Tensor, lens: _Lens
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, ids: Tensor, kinds: Tensor, lens: _Lens) -> None:
         """Take the geoms `ids` (G,), of types `kinds` (G,), of a model."""
         self._ids, self._lens = ids, lens
         self._bodies = torch.tensor(model.geom_bodyid).long()[ids]
@@ -422,7 +417,7 @@ class _Sight:
             if kind in kinds
         ]
 
-    def pose(self, read: ReadField, pos: torch.Tensor, mat: torch.Tensor) -> Geoms:
+    def pose(self, read: ReadField, pos: Tensor, mat: Tensor) -> Geoms:
         """Place the geoms in the frame of a camera at `pos` (n, 3) and `mat` (n, 3, 3)."""
         body_quat = read("xquat")[:, self._bodies]
         to_camera = quat_conjugate(quat_from_matrix(mat))[:, None].expand_as(body_quat)
@@ -461,7 +456,7 @@ class _Sight:
             exists=exists & (rgba[..., 3] != 0.0),
         )
 
-    def by_tile(self, geoms: Geoms, rays: _Rays) -> torch.Tensor:
+    def by_tile(self, geoms: Geoms, rays: _Rays) -> Tensor:
         """Return what rays of each tile may meet, (n, rows, columns, G) bool.
 
         A box around a geom is in sight of a tile unless it lies beyond one of the tile's sides.
@@ -483,7 +478,7 @@ class _Sight:
         left, right, top, bottom = inside.transpose(1, 2).split((columns, columns, rows, rows), 1)
         return (top & bottom)[:, :, None] & (left & right)[:, None]
 
-    def _around(self, geoms: Geoms) -> torch.Tensor:
+    def _around(self, geoms: Geoms) -> Tensor:
         """Return the convex geoms (n, G) that the camera is in, whose backs it does not see.
 
         Along each axis, the camera is at x of the extent beyond the core, which is a point but for
@@ -512,12 +507,7 @@ class _Slots:
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        kinds: torch.Tensor,
-        make_batch: MakeBatch,
-        rows: int,
-        rays: int,
+        self, model: mujoco.MjModel, kinds: Tensor, make_batch: MakeBatch, rows: int, rays: int
     ) -> None:
         """Prepare `rows` simulations for `rays` rays each, against geoms of types `kinds` (G,)."""
         self._model, self._kinds, self._make_batch = model, kinds, make_batch
@@ -525,7 +515,7 @@ class _Slots:
         # In double precision, as the batch wants them.
         self._origins, self._directions = np.zeros((rows, rays, 3)), np.zeros((rows, rays, 3))
 
-    def load(self, geoms: Geoms, in_sight: torch.Tensor) -> None:
+    def load(self, geoms: Geoms, in_sight: Tensor) -> None:
         """Put into each row the geoms that are in its sight: (rows, G) bool, rows by environment.
 
         There may be fewer rows than simulations; the others keep what they have.
@@ -558,7 +548,7 @@ class _Slots:
         self._values["geom_group"].fill_(_EMPTY)
         self._columns = torch.full((self.num_rows, self._width + 1), len(self._kinds))
 
-    def aim(self, directions: torch.Tensor, origins: torch.Tensor | None) -> None:
+    def aim(self, directions: Tensor, origins: Tensor | None) -> None:
         """Set the rays of n environments, (n or 1, P, 3); those of all if n is 1."""
         for target, source in ((self._directions, directions), (self._origins, origins)):
             if source is not None:
@@ -574,7 +564,7 @@ class _Slots:
         origins, directions = self._origins[:rows], self._directions[:rows]
         return cast_through(self._batch, origins, directions, passed, geomgroup=_MASK)
 
-    def columns(self, rows: Any, slots: np.ndarray) -> torch.Tensor:
+    def columns(self, rows: Any, slots: np.ndarray) -> Tensor:
         """Return the numbers of the geoms in `slots` (m, rays) of some rows; G for -1."""
         return self._columns[rows].gather(1, torch.from_numpy(slots).long() + 1)
 
@@ -635,7 +625,7 @@ class _Shading:
     times a power of the cosine between the surface and the direction halfway to the eye.
     """
 
-    def __init__(self, model: mujoco.MjModel, kinds: torch.Tensor, use_textures: bool) -> None:
+    def __init__(self, model: mujoco.MjModel, kinds: Tensor, use_textures: bool) -> None:
         """Take the lights and (if wanted) textures of a model, for geoms of types `kinds` (G,)."""
         self._num_lights, self._headlight = model.nlight, model.vis.headlight
         self._textures = Textures(model, torch.nn.functional.pad(kinds, (0, 1), value=-1))
@@ -645,11 +635,11 @@ class _Shading:
         self,
         met: Surfaces,
         geoms: Geoms,
-        pos: torch.Tensor,
-        mat: torch.Tensor,
+        pos: Tensor,
+        mat: Tensor,
         read: ReadField,
-        shadow: Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor] | None,
-    ) -> torch.Tensor:
+        shadow: Callable[[Tensor, Tensor, Tensor], Tensor] | None,
+    ) -> Tensor:
         """Return the colors of the rays, (n, P, 3) uint8.
 
         Args:
@@ -711,8 +701,8 @@ class _Shading:
         return torch.stack(rgb.mul_(255.0).to(torch.uint8).unbind(), dim=-1)
 
     def _lights(
-        self, points: torch.Tensor, pos: torch.Tensor, mat: torch.Tensor, read: ReadField
-    ) -> Iterator[tuple[torch.Tensor, ...]]:
+        self, points: Tensor, pos: Tensor, mat: Tensor, read: ReadField
+    ) -> Iterator[tuple[Tensor, ...]]:
         """Yield what each light that shines somewhere is at the points (3, n, P).
 
         Axes n and P may be 1. Yields:
@@ -724,7 +714,7 @@ class _Shading:
         endless, one = torch.full((1, 1), _ENDLESS), torch.ones(1, 1)
         for i in range(self._num_lights):
 
-            def own(name: str, i: int = i) -> torch.Tensor:
+            def own(name: str, i: int = i) -> Tensor:
                 return read(f"light_{name}")[:, i, None]
 
             active = own("active") != 0
@@ -764,6 +754,6 @@ class _Shading:
             yield diffuse, specular, direction, endless, one, torch.tensor(False)
 
 
-def _dot(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+def _dot(a: Tensor, b: Tensor) -> Tensor:
     """Return the products of vectors whose components come first."""
     return torch.addcmul(a[0] * b[0], a[1], b[1]).addcmul_(a[2], b[2])

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 import torch
+from torch import Tensor
 
 if TYPE_CHECKING:
     from mjlab.sim.native.render import Geoms, ReadField, Surfaces
@@ -33,7 +34,7 @@ _TINY = 1e-6
 class Textures:
     """The textures of a model, in one table of texels."""
 
-    def __init__(self, model: mujoco.MjModel, kinds: torch.Tensor) -> None:
+    def __init__(self, model: mujoco.MjModel, kinds: Tensor) -> None:
         """Take the textures of a model, for geoms of the types `kinds` (G + 1,), -1 for none."""
         self._kinds = kinds
         counts, texels = model.tex_width * model.tex_height, [np.zeros((0, 3), np.uint8)]
@@ -53,12 +54,7 @@ class Textures:
         self._sky = int(skies[0]) if len(skies) else None
 
     def paint(
-        self,
-        rgb: torch.Tensor,
-        met: Surfaces,
-        geoms: Geoms,
-        material: torch.Tensor,
-        read: ReadField,
+        self, rgb: Tensor, met: Surfaces, geoms: Geoms, material: Tensor, read: ReadField
     ) -> None:
         """Multiply the colors `rgb` (3, n, P) by the textures of materials.
 
@@ -110,7 +106,7 @@ class Textures:
             color[:, laid] = self._means[:, texture[laid]]
         rgb[:, env, pixel] *= color
 
-    def paint_sky(self, rgb: torch.Tensor, missed: torch.Tensor, directions: torch.Tensor) -> None:
+    def paint_sky(self, rgb: Tensor, missed: Tensor, directions: Tensor) -> None:
         """Fill the colors `rgb` (3, n, P) of the rays `missed` (n, P) with the sky.
 
         `directions` are those of the rays that missed, (3, K), in the world.
@@ -119,7 +115,7 @@ class Textures:
             uv = _sky_coordinates(directions, int(self._width[self._sky]))
             rgb[:, missed] = self._sample(torch.tensor(self._sky), uv)
 
-    def _sample(self, texture: torch.Tensor, uv: torch.Tensor) -> torch.Tensor:
+    def _sample(self, texture: Tensor, uv: Tensor) -> Tensor:
         """Return the colors (3, ...) at the places `uv` (2, ...) in [0, 1) of textures (...).
 
         Linear between the centers of texels, and constant beyond those of the outermost.
@@ -141,9 +137,7 @@ class Textures:
         return colors
 
 
-def of_materials(
-    values: torch.Tensor, material: torch.Tensor, default: float | bool
-) -> torch.Tensor:
+def of_materials(values: Tensor, material: Tensor, default: float | bool) -> Tensor:
     """Return values (a, nmat, ...) of materials (b, G): (max(a, b), G, ...).
 
     Geoms of material -1 get `default`.
@@ -154,14 +148,14 @@ def of_materials(
     return values[torch.arange(n)[:, None], material.expand(n, -1)]
 
 
-def of_pixels(values: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
+def of_pixels(values: Tensor, columns: Tensor) -> Tensor:
     """Return values (..., 1 or n, G + 1) of the geoms `columns` (n, P): (..., n, P)."""
     leading = values.shape[:-2]
     columns = columns.expand(*leading, *columns.shape)
     return values.expand(*columns.shape[:-1], -1).gather(-1, columns)
 
 
-def _turn_back(mat: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+def _turn_back(mat: Tensor, vectors: Tensor) -> Tensor:
     """Turn vectors (3, ...) by the inverses of the rotations (3, 3, ...)."""
     x, y, z = vectors
     return torch.stack([mat[0, i] * x + mat[1, i] * y + mat[2, i] * z for i in range(3)])
@@ -172,23 +166,23 @@ def _turn_back(mat: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
 # [0, 1). Axes after the first may be others, if they can be broadcast.
 
 
-def _wrap(u, v, repeat, offset=0.0) -> torch.Tensor:
+def _wrap(u, v, repeat, offset=0.0) -> Tensor:
     uv = torch.stack((u, v)) * repeat + offset
     return uv - uv.floor()
 
 
-def _scaled(repeat, uniform, lengths) -> torch.Tensor:
+def _scaled(repeat, uniform, lengths) -> Tensor:
     """Return repetitions along a whole geom: as given, or that many for each unit of length."""
     return torch.where(uniform, repeat * lengths, repeat)
 
 
-def _azimuth(x, y) -> torch.Tensor:
+def _azimuth(x, y) -> Tensor:
     """Return the angle about z in turns, 0 to 1."""
     turns = torch.atan2(y, x) / (2.0 * torch.pi)
     return torch.where(turns < 0.0, turns + 1.0, turns)
 
 
-def _plane(point, normal, size, repeat, uniform) -> torch.Tensor:
+def _plane(point, normal, size, repeat, uniform) -> Tensor:
     is_finite = size[:2] > 0.0
     along = [
         torch.where(finite, (p + side) / (2.0 * side.clamp(min=_TINY)), 0.5 * p)
@@ -198,18 +192,18 @@ def _plane(point, normal, size, repeat, uniform) -> torch.Tensor:
     return _wrap(*along, repeat, torch.where(is_finite.all(dim=0), 0.0, -0.5))
 
 
-def _ellipsoid(point, normal, size, repeat, uniform) -> torch.Tensor:
+def _ellipsoid(point, normal, size, repeat, uniform) -> Tensor:
     direction = point / size.clamp(min=_TINY)
     x, y, z = direction / direction.norm(dim=0).clamp(min=_TINY)
     v = 0.5 - torch.asin(z.clamp(-1.0, 1.0)) / torch.pi
     return _wrap(_azimuth(x, y), v, _scaled(repeat, uniform, size[:2]))
 
 
-def _sphere(point, normal, size, repeat, uniform) -> torch.Tensor:
+def _sphere(point, normal, size, repeat, uniform) -> Tensor:
     return _ellipsoid(point, normal, size[:1].expand_as(size), repeat, uniform)
 
 
-def _cylinder(point, normal, size, repeat, uniform) -> torch.Tensor:
+def _cylinder(point, normal, size, repeat, uniform) -> Tensor:
     (x, y, z), (radius, half, _) = point, size.clamp(min=_TINY)
     is_end = normal[2].abs() > _END
     u = torch.where(is_end, 0.5 + 0.5 * x / radius, _azimuth(x, y))
@@ -217,7 +211,7 @@ def _cylinder(point, normal, size, repeat, uniform) -> torch.Tensor:
     return _wrap(u, v, _scaled(repeat, uniform, size[0]))
 
 
-def _capsule(point, normal, size, repeat, uniform) -> torch.Tensor:
+def _capsule(point, normal, size, repeat, uniform) -> Tensor:
     (x, y, z), (radius, half, _) = point, size.clamp(min=_TINY)
     on_cap = torch.asin(((z.abs() - half) / radius).clamp(0.0, 1.0)) * (2.0 / torch.pi)
     v = torch.where(z > half, 1.0 - on_cap, (half - z) / (2.0 * half))
@@ -225,7 +219,7 @@ def _capsule(point, normal, size, repeat, uniform) -> torch.Tensor:
     return _wrap(_azimuth(x, y), v, _scaled(repeat, uniform, size[0]))
 
 
-def _box(point, normal, size, repeat, uniform) -> torch.Tensor:
+def _box(point, normal, size, repeat, uniform) -> Tensor:
     # Places from -1 to 1 along each side.
     x, y, z = point / size.clamp(min=_TINY)
     across = normal.abs()
@@ -237,12 +231,12 @@ def _box(point, normal, size, repeat, uniform) -> torch.Tensor:
     return _wrap(0.5 + 0.5 * u, 0.5 + 0.5 * v, _scaled(repeat, uniform, size[:2]))
 
 
-def _hfield(point, normal, size, repeat, uniform) -> torch.Tensor:
+def _hfield(point, normal, size, repeat, uniform) -> Tensor:
     x, y = point[:2] / size[:2].clamp(min=_TINY)
     return _wrap(0.5 + 0.5 * x, 0.5 - 0.5 * y, _scaled(repeat, uniform, size[:2]))
 
 
-def _mesh(point, normal, size, repeat, uniform) -> torch.Tensor:
+def _mesh(point, normal, size, repeat, uniform) -> Tensor:
     scaled = torch.where((size[:2] > 0.0) & ~uniform, repeat / size[:2], repeat)
     return _wrap(0.5 * point[0], -0.5 * point[1], scaled, -0.5)
 
@@ -261,7 +255,7 @@ KINDS = frozenset(_MAPPINGS)
 """Types of geoms that cameras see."""
 
 
-def _sky_coordinates(direction: torch.Tensor, width: int) -> torch.Tensor:
+def _sky_coordinates(direction: Tensor, width: int) -> Tensor:
     """Return places (2, K) in the strip of six faces that world directions (3, K) point to.
 
     The cube is turned a quarter about x. Its faces are +x, -x, +y, -y, +z and -z.

@@ -14,7 +14,7 @@ import functools
 import gc
 import logging
 import os
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Hashable, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -133,26 +133,18 @@ class WarpEngine(Engine):
         cfg.apply_wp_opt(self.wp_model.opt)
         self._data_tensors: dict[str, torch.Tensor] = {}
         self.model_fields: dict[str, torch.Tensor] = {}
-        self._graphs: dict[str, Any] = {}
+        self._graphs: dict[Hashable, Any] = {}
         self._captures = True
         self._absent: torch.Tensor | None = None
         self._rays = WarpRays(self)
-        self._renderer = WarpRenderer(self)
+        self.renderer = WarpRenderer(self)
         # Columns of `sensordata` by the stage that computes them.
         stages = np.repeat(model.sensor_needstage, model.sensor_dim)
         self._sensor_stages = torch.as_tensor(stages, device=self.device)
         # Read or not, these have to be kept.
-        self.data_field("sensordata")
-        self.data_field("history")
-        if self.wp_model.sensor_rne_postconstraint:
-            self.data_field("cacc")
-            self.data_field("cfrc_int")
-        self.capacities = {
-            "njmax": self.wp_data.njmax,
-            "nconmax": self.wp_data.naconmax // self.num_envs,
-            "contact_sensor_maxmatch": cfg.contact_sensor_maxmatch,
-        }
-        """Room for constraint rows and contacts per environment, and for matches of a sensor."""
+        forces = ("cacc", "cfrc_int") if self.wp_model.sensor_rne_postconstraint else ()
+        for name in ("sensordata", "history", *forces):
+            self.data_field(name)
         self._overflow = OverflowWatch(self, as_torch(self.wp_data.overflow))
         self.capabilities = Capabilities(
             name="warp",
@@ -222,7 +214,7 @@ class WarpEngine(Engine):
             torch_stream.wait_stream(self.wp_device.stream)
 
     def launch(
-        self, name: str, work: Callable[[], None], times: int = 1, on_cpu: bool = True
+        self, name: Hashable, work: Callable[[], None], times: int = 1, on_cpu: bool = True
     ) -> None:
         """Run `work` some times by replaying its graph.
 
@@ -477,12 +469,8 @@ class WarpEngine(Engine):
                 mask = None if chosen is None else wp.from_torch(chosen)
                 mjwarp.reset_history(self.wp_model, self.wp_data, reset=mask)
 
-    def check_overflow(self) -> None:
-        """Log now, once a kind, what exceeded its capacity so far. Waits for the GPU."""
-        self._overflow.check(wait=True)
-
     def measure_sizes(self) -> torch.Tensor:
-        """Return what is needed now of each of `capacities`, (3,).
+        """Return what is needed now of each of `SIZES`, (3,).
 
         No sensor can match more contacts than its environment has.
         """
@@ -497,8 +485,8 @@ class WarpEngine(Engine):
         return torch.stack([rows, -(-pooled // self.num_envs), totals.amax()])
 
     def close(self) -> None:
-        """Log what exceeded its capacity since the last look."""
-        self.check_overflow()
+        """Log, once a kind, what exceeded its capacity so far. Waits for the GPU."""
+        self._overflow.check(wait=True)
 
     # Queries.
 
@@ -516,11 +504,7 @@ class WarpEngine(Engine):
         )
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:
-        return self._renderer.render(views)
-
-    def render_context(self, views: tuple[CameraView, ...], view: CameraView) -> Any:
-        """Return the `mujoco_warp.RenderContext` of a view, one of `views` rendered together."""
-        return self._renderer.context_of(views, view)
+        return self.renderer.render(views)
 
     # Copies.
 
@@ -675,9 +659,8 @@ def expand_arrays(model: Any, nworld: int, names: list[str]) -> list[Any]:
         if nworld == 1 or shared.shape[0] == nworld:
             continue
         own = wp.empty((nworld, *shared.shape[1:]), dtype=shared.dtype, device=shared.device)
-        if own.size:
-            with _torch_on_warps_stream(shared.device):
-                as_torch(own).copy_(as_torch(shared).expand(nworld, *as_torch(shared).shape[1:]))
+        with _torch_on_warps_stream(shared.device):
+            as_torch(own).copy_(as_torch(shared))
         own._is_batched = True
         setattr(struct, attribute, own)
     return [getattr(struct, attribute) for struct, attribute in found]

@@ -54,6 +54,10 @@ class OverflowWatch:
     def __init__(self, engine: WarpEngine, flags: torch.Tensor) -> None:
         """Watch `flags` (N,) int32 of an engine, which Warp sets and does not clear."""
         self._engine, self._flags = engine, flags
+        data, matches = engine.wp_data, engine.wp_model.opt.contact_sensor_maxmatch
+        # Room for constraint rows and contacts per environment, and for matches of a sensor.
+        sizes = data.njmax, data.naconmax // data.nworld, matches
+        self._sizes = dict(zip(SIZES, sizes, strict=True))
         self._kinds = [kind for kind in mjwarp.OverflowType if kind.name in _OUTGROWN | _OTHER]
         self._reported: set[str] = set()
         self._bits = torch.tensor(self._kinds, dtype=torch.int32, device=flags.device)
@@ -93,7 +97,7 @@ class OverflowWatch:
             message = _OTHER.get(kind.name)
             if message is None:
                 option, what = _OUTGROWN[kind.name]
-                size, need = self._engine.capacities[option], needed[option]
+                size, need = self._sizes[option], needed[option]
                 # Twice what was not enough at some time, or a quarter more than is needed now.
                 enough, hint = 2 * size, ", and to more if this comes again"
                 if need > size:

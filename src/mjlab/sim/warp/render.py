@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -33,8 +32,6 @@ class WarpRenderer:
     def __init__(self, engine: WarpEngine) -> None:
         self._engine = engine
         self._scenes: dict[Any, _Scene] = {}
-        # A graph's name is used once, so that none is replayed for another context.
-        self._numbers = itertools.count()
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:
         """Render views at the poses that derived fields have; see `Engine.render`."""
@@ -47,10 +44,9 @@ class WarpRenderer:
         for settings, members in by_settings.items():
             scene = self._scenes.get((views, settings))
             if scene is None or scene.expanded != relevant:
-                name = f"render {next(self._numbers)}"
                 # Images that are made here are written into in later calls, in whatever mode.
                 with self._engine.ordered(), torch.inference_mode(False):
-                    scene = _Scene(self._engine, members, relevant, name)
+                    scene = _Scene(self._engine, members, relevant)
                 self._scenes[views, settings] = scene
             images |= scene.render()
         return [images[i] for i in range(len(views))]
@@ -67,10 +63,9 @@ class _Scene:
     """One render context, and the views that are rendered with it."""
 
     def __init__(
-        self, engine: WarpEngine, views: dict[int, CameraView], expanded: frozenset[str], name: str
+        self, engine: WarpEngine, views: dict[int, CameraView], expanded: frozenset[str]
     ) -> None:
-        self.views, self.expanded = views, expanded
-        self._engine, self._name = engine, name
+        self.views, self.expanded, self._engine = views, expanded, engine
         host, cameras = engine.mj_model, list(views.values())
         first = cameras[0]
         self.context: Any = None
@@ -138,7 +133,7 @@ class _Scene:
             mjwarp.refit_bvh(model, data, self.context)
             mjwarp.render(model, data, self.context)
 
-        self._engine.launch(self._name, work, on_cpu=False)
+        self._engine.launch(self, work, on_cpu=False)
         for packed, rgb in self._packed:
             rgb.copy_(packed.flip(-1))
         return self._images
