@@ -54,38 +54,17 @@ class MujocoCfg:
         Raises:
             ValueError: an option or flag that MuJoCo does not know, with those it does.
         """
-        from mjlab.utils.mujoco import OPTION_ENUMS
+        from mjlab.utils.mujoco import OPTION_ENUMS, enum_value
 
         for option in fields(MujocoCfg):
             name, value = option.name, getattr(self, option.name)
             if name == "enableflags":
                 value = tuple(flag for flag in value if flag not in ALWAYS_ENABLED_FLAGS)
             if name in OPTION_ENUMS:
-                value = _enum_value(f"MujocoCfg.{name}", value, *OPTION_ENUMS[name])
+                value = enum_value(f"MujocoCfg.{name}", value, *OPTION_ENUMS[name])
             if name.endswith("flags"):
                 value |= getattr(model.opt, name)
             setattr(model.opt, name, value)
-
-
-def _enum_value(option: str, value: str | tuple[str, ...], enum: Any, prefix: str = "") -> int:
-    """Return an enum's member for a lower-case name, or the bits of several names.
-
-    Raises:
-        ValueError: an unknown name, with the valid ones.
-    """
-    members = {
-        member[len(prefix) :].lower(): value
-        for member, value in enum.__members__.items()
-        if member.startswith(prefix)
-    }
-    bits = 0
-    for name in (value,) if isinstance(value, str) else value:
-        if name not in members:
-            raise ValueError(
-                f"{option}: {name!r} is not known to MuJoCo. Choose from: {', '.join(members)}."
-            )
-        bits |= int(members[name])
-    return bits
 
 
 @dataclass(kw_only=True)
@@ -119,6 +98,8 @@ class SimulationCfg:
         """Write the Warp-only options onto `mujoco_warp`'s `Option`."""
         import warnings
 
+        from mjlab.utils.mujoco import enum_value
+
         if self.ls_parallel is not None:
             warnings.warn(
                 "SimulationCfg.ls_parallel has no effect any more; remove it.",
@@ -129,4 +110,4 @@ class SimulationCfg:
         for name in ("broadphase", "broadphase_filter"):
             value, enum = getattr(self, name), type(getattr(wp_opt, name))
             if value is not None:
-                setattr(wp_opt, name, enum(_enum_value(f"SimulationCfg.{name}", value, enum)))
+                setattr(wp_opt, name, enum(enum_value(f"SimulationCfg.{name}", value, enum)))

@@ -186,11 +186,6 @@ def rendered_geoms(model: mujoco.MjModel, groups: Container[int]) -> list[int]:
     return [i for i, group in enumerate(model.geom_group.clip(0, 5)) if group in groups]
 
 
-def far_limit(model: mujoco.MjModel) -> float:
-    """Return the depth in meters beyond which nothing is visible; 0 for no limit."""
-    return float(model.vis.map.zfar * model.stat.extent)
-
-
 # Engine.
 
 

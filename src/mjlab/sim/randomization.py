@@ -153,11 +153,9 @@ class VariantValues:
             for combination in combinations
         ]
         self._values = _compute_values(model, chosen, derived)
-        absent = np.zeros((len(chosen), model.ngeom), dtype=bool)
-        for mask, parts in zip(absent, chosen, strict=True):
-            for part in parts:
-                mask[part.absent_geoms] = True
-        self.absent_geoms = absent[self._row]
+        absent = [np.concatenate([part.absent_geoms for part in parts]) for parts in chosen]
+        masks = [np.isin(np.arange(model.ngeom), geoms) for geoms in absent]
+        self.absent_geoms = np.stack(masks)[self._row]
         """(N, ngeom) bool: geoms that an environment does not have."""
 
     @property

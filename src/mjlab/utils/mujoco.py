@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -32,14 +32,34 @@ OPTION_ENUMS = {
 """Options whose values are members of an enum (flags: bits), with the prefix of the members."""
 
 
+def enum_value(option: str, value: str | tuple[str, ...], enum: Any, prefix: str = "") -> int:
+    """Return an enum's member for a lower-case name, or the bits of several names.
+
+    Raises:
+        ValueError: an unknown name, with the valid ones. `option` says where it was given.
+    """
+    members = _members(enum, prefix)
+    bits = 0
+    for name in (value,) if isinstance(value, str) else value:
+        if name not in members:
+            raise ValueError(
+                f"{option}: {name!r} is not known to MuJoCo. Choose from: {', '.join(members)}."
+            )
+        bits |= members[name]
+    return bits
+
+
 def flag_names(option: str, bits: int) -> list[str]:
     """Return the lower-case names of the bits that are set in `disableflags` or `enableflags`."""
-    enum, prefix = OPTION_ENUMS[option]
-    return [
-        member.removeprefix(prefix).lower()
-        for member, bit in enum.__members__.items()
-        if member.startswith(prefix) and int(bits) & int(bit)
-    ]
+    return [name for name, bit in _members(*OPTION_ENUMS[option]).items() if bits & bit]
+
+
+def _members(enum: Any, prefix: str) -> dict[str, int]:
+    return {
+        name.removeprefix(prefix).lower(): int(value)
+        for name, value in enum.__members__.items()
+        if name.startswith(prefix)
+    }
 
 
 def qpos_width(joint_type: int | mujoco.mjtJoint) -> int:

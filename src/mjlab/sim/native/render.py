@@ -25,7 +25,6 @@ from mjlab.sim.engine import (
     CameraView,
     Engine,
     Images,
-    far_limit,
     rendered_geoms,
 )
 from mjlab.sim.native.rays import CullingRule, Hits, Passed, cast_through
@@ -202,7 +201,8 @@ class _View:
         self._ids = torch.tensor([*rendered_geoms(model, view.geom_groups)[::-1], BACKGROUND])
         kinds = torch.tensor(model.geom_type)[self._ids[:-1]]
         self._sight = _Sight(model, self._ids[:-1], kinds, self._lens)
-        self._far = far_limit(model) or np.inf
+        # Depth (m) beyond which nothing is visible, unless it is 0.
+        self._far = float(model.vis.map.zfar * model.stat.extent) or np.inf
         self.envs_at_a_time = min(num_envs, max(1, _RAYS_AT_A_TIME // self._lens.num_rays))
         make_slots, rows = partial(_Slots, model, kinds, make_batch), self.envs_at_a_time
         self._slots = make_slots(rows * self._lens.num_tiles, self._lens.tile_rays)

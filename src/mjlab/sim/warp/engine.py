@@ -92,9 +92,8 @@ class UnsupportedByWarpError(EngineUnavailableError, NotImplementedError):
 
 def _be_quiet() -> None:
     """Keep Warp's banner and its compile messages from users who did not ask for them."""
-    if os.environ.get("MJLAB_WARP_QUIET", "1").strip().lower() in ("0", "false", "no"):
-        return
-    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    if os.environ.get("MJLAB_WARP_QUIET", "1").strip().lower() not in ("0", "false", "no"):
+        wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
 
 
 class WarpEngine(Engine):
@@ -382,26 +381,24 @@ class WarpEngine(Engine):
             mjwarp.fwd_kinematics(self.wp_model, self.wp_data)
             mjwarp.com_vel(self.wp_model, self.wp_data)
 
-    def forward(self, env_ids: torch.Tensor | None, stage: Stage = "acc") -> None:
-        self._forward_except(self._rows_except(env_ids), stage)
-
     def forward_after_reset(self, reset_ids: torch.Tensor) -> None:
         # One full pass, because a partial one costs as much as one of all.
-        self._forward_except(self._rows_except(reset_ids), "acc", kept_from="acc")
+        self.forward(reset_ids, kept_from="acc")
 
-    def _forward_except(
-        self, others: torch.Tensor | None, stage: Stage, kept_from: Stage = "pos"
+    def forward(
+        self, env_ids: torch.Tensor | None, stage: Stage = "acc", kept_from: Stage = "pos"
     ) -> None:
-        """Compute stages up to `stage`; environments `others` keep their results of some stages.
+        """Compute stages up to `stage`; other environments keep their results of some stages.
 
         Warp computes all environments and uses fields of later stages as scratch. Those get their
         values back: fields that are one substep old stay so, as on native.
 
         Args:
-            others: (N,) bool, or None for no environment.
+            env_ids: Environments, or None for all.
             stage: Last stage.
-            kept_from: First stage of the results that `others` keep, "pos" (all) or "acc".
+            kept_from: First stage of the results that the others keep, "pos" (all) or "acc".
         """
+        others = self._rows_except(env_ids)
         results = ACCELERATION_FIELDS if kept_from == "acc" else self._data_tensors.keys()
         kept: list[tuple[torch.Tensor, torch.Tensor | None]] = []
         for name, tensor in self._data_tensors.items():
@@ -493,15 +490,7 @@ class WarpEngine(Engine):
     def raycast(self, query: RayQuery) -> RayHits:
         if self.capabilities.raycast_problem is not None:
             raise UnsupportedByWarpError(self.capabilities.raycast_problem)
-        distances, normals, geom_ids = self._rays.cast(query)
-        missed = distances < 0.0
-        if query.max_distances is not None:
-            missed = missed | (distances > query.max_distances)
-        return (
-            distances.masked_fill(missed, -1.0),
-            normals.masked_fill(missed[..., None], 0.0),
-            geom_ids.masked_fill(missed, -1),
-        )
+        return self._rays.cast(query)
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:
         return self.renderer.render(views)

@@ -28,10 +28,7 @@ class WarpRays:
         self._buffers: dict[Any, _Buffers] = {}
 
     def cast(self, query: RayQuery) -> RayHits:
-        """Return distances, normals and geom ids at the current poses; those of misses are any.
-
-        They are overwritten by the next call with as many rays into the same groups.
-        """
+        """Cast rays; see `Engine.raycast`."""
         key = (query.geom_groups, query.origins.shape[1])
         if key not in self._buffers:
             model = self._engine.mj_model
@@ -44,7 +41,15 @@ class WarpRays:
         buffers.excluded[:] = -1 if query.exclude_body_ids is None else query.exclude_body_ids
         if buffers.groups:
             self._engine.launch(f"rays {key}", lambda: self._run(buffers), on_cpu=False)
-        return buffers.distances, buffers.normals, buffers.geom_ids
+        missed = buffers.distances < 0.0
+        if query.max_distances is not None:
+            missed = missed | (buffers.distances > query.max_distances)
+        # The buffers are overwritten by the next call.
+        return (
+            buffers.distances.masked_fill(missed, -1.0),
+            buffers.normals.masked_fill(missed[..., None], 0.0),
+            buffers.geom_ids.masked_fill(missed, -1),
+        )
 
     def _run(self, buffers: _Buffers) -> None:
         model, data = self._engine.wp_model, self._engine.wp_data
