@@ -59,11 +59,9 @@ ACCELERATION_FIELDS = frozenset(
 # Which geoms may touch each other.
 COLLISION_MASKS = ("geom_contype", "geom_conaffinity")
 
+_FORCE_SENSORS = ("accelerometer", "force", "torque", "framelinacc", "frameangacc")
 _SENSORS_BY_FIELD = {
-    **dict.fromkeys(
-        ("cacc", "cfrc_int", "cfrc_ext"),
-        ("accelerometer", "force", "torque", "framelinacc", "frameangacc"),
-    ),
+    **dict.fromkeys(("cacc", "cfrc_int", "cfrc_ext"), _FORCE_SENSORS),
     **dict.fromkeys(("subtree_linvel", "subtree_angmom"), ("subtreelinvel", "subtreeangmom")),
 }
 

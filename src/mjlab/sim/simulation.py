@@ -222,11 +222,10 @@ class Simulation:
     @property
     def world_to_variant(self) -> dict[str, torch.Tensor]:
         """Variant index of each environment, (N,) int64, by entity; empty without variants."""
-        if self._variants is None:
-            return {}
+        variants = {} if self._variants is None else self._variants.world_to_variant
         return {
             name: torch.as_tensor(ids, dtype=torch.int64, device=self.device)
-            for name, ids in self._variants.world_to_variant.items()
+            for name, ids in variants.items()
         }
 
     @cached_property
@@ -405,12 +404,10 @@ class Simulation:
             EngineUnavailableError: it has ray sensors, and the engine casts no rays in this model;
                 or it has cameras, and the engine does not render this model.
         """
-        for is_needed, problem in (
-            (ctx.has_raycasts, self.capabilities.raycast_problem),
-            (ctx.has_cameras, self.capabilities.render_problem),
-        ):
-            if is_needed and problem is not None:
-                raise EngineUnavailableError(problem)
+        problem = ctx.has_raycasts and self.capabilities.raycast_problem
+        problem = problem or (ctx.has_cameras and self.capabilities.render_problem)
+        if problem:
+            raise EngineUnavailableError(problem)
         self._sensor_context = ctx
         ctx.set_render_context_source(self.render_context)
 
@@ -439,9 +436,8 @@ class Simulation:
         per ray whose own geoms are not (-1: none); what is farther than `max_distances` (R,) is a
         miss. Planes are hit from above only, meshes and height fields from outside only.
         """
-        return self._engine.raycast(
-            RayQuery(origins, directions, geom_groups, exclude_body_ids, max_distances)
-        )
+        query = RayQuery(origins, directions, geom_groups, exclude_body_ids, max_distances)
+        return self._engine.raycast(query)
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:
         """Render what cameras see at the poses of the last `forward`; see `CameraView`, `Images`.

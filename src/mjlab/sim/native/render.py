@@ -19,14 +19,7 @@ import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
-from mjlab.sim.engine import (
-    BACKGROUND,
-    LENS_FIELDS,
-    CameraView,
-    Engine,
-    Images,
-    rendered_geoms,
-)
+from mjlab.sim.engine import BACKGROUND, LENS_FIELDS, CameraView, Engine, Images, rendered_geoms
 from mjlab.sim.native.rays import CullingRule, Hits, Passed, cast_through
 from mjlab.sim.native.textures import (
     BOX,

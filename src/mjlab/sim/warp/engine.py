@@ -443,7 +443,7 @@ class WarpEngine(Engine):
 
     def reset(self, env_ids: torch.Tensor | None) -> None:
         # `mjwarp.reset_data` clears the contacts of all environments together with those of the
-        # first, and only as many activations as there are controls; so each field is reset here.
+        # first, and overflow flags before they are read; so each field is reset here.
         for name in (*ZERO_INPUTS, *_RESULTS_ZERO_ON_RESET):
             tensor = self.data_field(name)
             tensor.zero_() if env_ids is None else tensor.index_fill_(0, env_ids, 0)
@@ -461,9 +461,8 @@ class WarpEngine(Engine):
             tensor[rows] = values.expand(tensor.shape)[rows]
         if self.mj_model.nhistory:
             others = self._rows_except(env_ids)
-            chosen = None if others is None else ~others
+            mask = None if others is None else wp.from_torch(~others)
             with self.ordered():
-                mask = None if chosen is None else wp.from_torch(chosen)
                 mjwarp.reset_history(self.wp_model, self.wp_data, reset=mask)
 
     def measure_sizes(self) -> torch.Tensor:
