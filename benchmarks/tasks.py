@@ -14,6 +14,7 @@ from report import Row, show
 from timing import BareLoop, alternate
 
 from mjlab.envs import ManagerBasedRlEnv
+from mjlab.sim.engine import RayQuery
 from mjlab.tasks.registry import load_env_cfg
 
 NUM_THREADS = 2
@@ -53,15 +54,15 @@ def make_env(task: str, num_envs: int) -> ManagerBasedRlEnv:
     return env
 
 
-def recorded_rays(env: ManagerBasedRlEnv) -> list[tuple[Any, ...]]:
-    """Return the arguments of all ray casts of one step."""
-    calls: list[tuple[Any, ...]] = []
+def recorded_rays(env: ManagerBasedRlEnv) -> list[RayQuery]:
+    """Return all ray casts of one step."""
+    queries: list[RayQuery] = []
     engine: Any = env.sim._engine
     original = engine.raycast
-    engine.raycast = lambda *args: calls.append(args) or original(*args)
+    engine.raycast = lambda query: queries.append(query) or original(query)
     env.sim.sense()
     engine.raycast = original
-    return calls
+    return queries
 
 
 def measure_case(case: Case) -> Row:
@@ -86,8 +87,8 @@ def measure_case(case: Case) -> Row:
             values[:] = getattr(env.sim.data, name).numpy()
         if case.with_rays:
             bare.cast(
-                (origins.numpy(), directions.numpy(), tuple(groups or range(6)))
-                for origins, directions, groups, *_ in recorded_rays(env)
+                (rays.origins.numpy(), rays.directions.numpy(), tuple(rays.geom_groups or range(6)))
+                for rays in recorded_rays(env)
             )
 
     same_states()

@@ -28,6 +28,7 @@ from gpu_parts.tasks import (
     stepped_env,
 )
 from mjlab.envs import ManagerBasedRlEnv
+from mjlab.sim.engine import RayQuery
 from mjlab.sim.randomization import expand_model_fields
 from mjlab.sim.sim_data import TorchArray
 
@@ -71,7 +72,7 @@ class BareWarp:
                 wait(env.device)
                 inertia = TorchArray(self._model.stat.meaninertia).tensor
                 inertia.copy_(engine.model_fields["stat.meaninertia"])
-            self._rays = [_Rays(env, *call) for call in _recorded_rays(env)]
+            self._rays = [_Rays(env, query) for query in _recorded_rays(env)]
             wait(env.device)
             # Kernels are loaded by the first call. On a GPU the next ones replay a graph.
             self._work()
@@ -107,14 +108,8 @@ class BareWarp:
 class _Rays:
     """Rays of one query of the environments, as `mujoco_warp` takes them."""
 
-    def __init__(
-        self,
-        env: ManagerBasedRlEnv,
-        origins: torch.Tensor,
-        directions: torch.Tensor,
-        groups: tuple[int, ...] | None,
-        excluded: torch.Tensor | None,
-    ) -> None:
+    def __init__(self, env: ManagerBasedRlEnv, query: RayQuery) -> None:
+        origins, groups, excluded = query.origins, query.geom_groups, query.exclude_body_ids
         shape, device = tuple(origins.shape[:2]), origins.device
         self.count = shape[1]
         if excluded is None:
@@ -122,7 +117,7 @@ class _Rays:
         # Kept, because Warp's arrays do not keep the tensors whose memory they are.
         self._tensors = (
             origins.contiguous().clone(),
-            directions.contiguous().clone(),
+            query.directions.contiguous().clone(),
             excluded.to(torch.int32).contiguous(),
             torch.empty(shape, device=device),
             torch.empty(shape, dtype=torch.int32, device=device),
@@ -164,17 +159,17 @@ class _Rays:
         )
 
 
-def _recorded_rays(env: ManagerBasedRlEnv) -> list[tuple[Any, ...]]:
-    """Return origins, directions, groups and excluded bodies of all queries of one step."""
-    calls: list[tuple[Any, ...]] = []
+def _recorded_rays(env: ManagerBasedRlEnv) -> list[RayQuery]:
+    """Return all ray queries of one step."""
+    queries: list[RayQuery] = []
     engine: Any = env.sim._engine
     original = engine.raycast
-    engine.raycast = lambda *args: calls.append(args[:4]) or original(*args)
+    engine.raycast = lambda query: queries.append(query) or original(query)
     try:
         env.sim.sense()
     finally:
         del engine.raycast
-    return calls
+    return queries
 
 
 def measure(options: Options) -> Iterator[Row]:
