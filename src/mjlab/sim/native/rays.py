@@ -82,8 +82,7 @@ class NativeRays:
                 hits.take_nearer(self._cast_in_batch(query, static=False))
         if query.max_distances is not None:
             hits.forget(hits.distances > query.max_distances.numpy())
-        arrays = hits.distances, hits.normals, hits.geoms
-        distances, normals, geoms = map(torch.from_numpy, arrays)
+        distances, normals, geoms = map(torch.from_numpy, vars(hits).values())
         return distances, normals, geoms
 
     def _ground(
@@ -120,9 +119,8 @@ class NativeRays:
         origins, directions = query.origins.numpy(), query.directions.numpy()
         pos, mat = (np.broadcast_to(x, (len(origins), *x.shape)) for x in (self._pos, self._mat))
         if self._fields_are_carried:
-            pos, mat = (
-                self._engine.data_field(name).numpy() for name in ("geom_xpos", "geom_xmat")
-            )
+            field = self._engine.data_field
+            pos, mat = field("geom_xpos").numpy(), field("geom_xmat").numpy()
 
         def passed(rows: Array, origins: Array, directions: Array, hits: Hits) -> Array:
             return self._rule.passed(origins, directions, hits, hits.geoms, rows, pos, mat)
@@ -376,12 +374,12 @@ class GroundTable:
 
     def cast(self, origins: Array) -> Hits:
         """Cast rays straight down from `origins` (n, R, 3)."""
-        shape, up = origins.shape[:2], np.zeros(origins.shape, np.float32)
-        up[..., 2] = 1.0
+        shape, normals = origins.shape[:2], np.zeros(origins.shape, np.float32)
+        normals[..., 2] = 1.0
         if self._level is not None:
             # 0.5 to 0.7 of the time that `sim.sense` takes otherwise (G1 and Go1 on flat ground).
             gaps = origins[..., 2].astype(np.float64) - self._level
-            hits = Hits(gaps.astype(np.float32), up, np.full(shape, self._geoms[0]))
+            hits = Hits(gaps.astype(np.float32), normals, np.full(shape, self._geoms[0]))
             hits.forget(~((gaps >= 0.0) & (gaps < np.inf)))
             return hits
         points = np.ascontiguousarray(origins.reshape(-1, 3).T, dtype=np.float64)
@@ -391,11 +389,11 @@ class GroundTable:
         y = np.fmin(np.fmax(y, 0.0), self._shape[1] - 1).astype(np.int64)
         cell = x * self._shape[1] + y
         met = self._covering.take(cell)
-        normals = up.reshape(-1, 3)
+        by_ray = normals.reshape(-1, 3)
         # Most rays start above a geom that covers their cell.
-        distance = self._gaps(met, points, normals)
+        distance = self._gaps(met, points, by_ray)
         rays = np.flatnonzero(~(distance >= 0.0))
-        distance[rays], met[rays], normals[rays] = np.inf, -1, _UP
+        distance[rays], met[rays], by_ray[rays] = np.inf, -1, _UP
         entry = self._first[cell[rays]]
         while len(rays):
             geom, starts = self._entries[entry], points.take(rays, axis=1)
@@ -410,12 +408,12 @@ class GroundTable:
             is_nearer &= (gap >= 0.0) & (gap < distance[rays])
             chosen = rays[is_nearer]
             distance[chosen], met[chosen] = gap[is_nearer], geom[is_nearer]
-            normals[chosen] = normal[is_nearer]
+            by_ray[chosen] = normal[is_nearer]
             entry += 1
             goes_on = starts[2] - self._top[self._entries[entry]] < distance[rays]
             rays, entry = rays[goes_on], entry[goes_on]
         distances = distance.astype(np.float32).reshape(shape)
-        hits = Hits(distances, normals.reshape(origins.shape), self._geoms.take(met).reshape(shape))
+        hits = Hits(distances, normals, self._geoms.take(met).reshape(shape))
         hits.forget(~np.isfinite(distances))
         return hits
 

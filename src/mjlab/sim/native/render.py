@@ -75,13 +75,8 @@ class NativeRenderer:
         torch.set_default_dtype(torch.float32)
         try:
             by_view = [self._workers(view) for view in views]
-            jobs = [
-                self._pool.submit(self._work, worker, number)
-                for workers in by_view
-                for number, worker in enumerate(workers)
-            ]
-            for job in jobs:
-                job.result()
+            tasks = [task for workers in by_view for task in enumerate(workers)]
+            list(self._pool.map(self._work, tasks))
         finally:
             torch.set_num_threads(threads)
             torch.set_default_dtype(default)
@@ -99,8 +94,9 @@ class NativeRenderer:
             ]
         return self._views[view]
 
-    def _work(self, view: _View, number: int) -> None:
-        """Render the share of worker `number`."""
+    def _work(self, task: tuple[int, _View]) -> None:
+        """Render the share of a worker with its number."""
+        number, view = task
         torch.set_num_threads(1)
         lens_varies = not LENS_FIELDS.isdisjoint(self._engine.model_fields)
         num_envs, step = self._engine.num_envs, view.envs_at_a_time
