@@ -82,8 +82,8 @@ class NativeRays:
                 hits.take_nearer(self._cast_in_batch(query, static=False))
         if query.max_distances is not None:
             hits.forget(hits.distances > query.max_distances.numpy())
-        distances, normals, geoms = map(torch.from_numpy, vars(hits).values())
-        return distances, normals, geoms
+        distances, normals = torch.from_numpy(hits.distances), torch.from_numpy(hits.normals)
+        return distances, normals, torch.from_numpy(hits.geoms)
 
     def _ground(
         self, groups: tuple[int, ...] | None, excluded: Array
