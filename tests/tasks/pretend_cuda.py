@@ -269,7 +269,11 @@ class PretendEngine(Engine):
 
     def __init__(self, engine: Engine, mode: PretendCuda) -> None:
         self._hosted, self._mode = engine, mode
-        self.capabilities = dataclasses.replace(engine.capabilities, device=DEVICE)
+        self.num_envs, self.capabilities = engine.num_envs, engine.capabilities
+
+    @property
+    def model_fields(self) -> dict[str, torch.Tensor]:
+        return mark(dict(self._hosted.model_fields))
 
     def _call(self, name: str, *args: Any) -> Any:
         with self._mode.paused():
