@@ -101,7 +101,8 @@ def test_reset_logs_and_zeroes_metrics_of_its_environments(env):
     manager, term = make(env)
     for _ in range(3):
         manager.compute(0.1)
-    assert manager.reset(torch.tensor([1, 2])) == {"Metrics/goal/updates": 3.0}
+    ids = torch.tensor([1, 2], dtype=torch.int32)
+    assert manager.reset(ids) == {"Metrics/goal/updates": 3.0}
     assert term.metrics["updates"].tolist() == [3.0, 0.0, 0.0, 3.0]
     assert manager.reset(torch.tensor([], dtype=torch.long)) == {}
 

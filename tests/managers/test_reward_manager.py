@@ -111,13 +111,6 @@ def test_terms_of_any_type_are_summed(env, dtype):
     assert manager.compute(0.02).dtype == torch.float32
 
 
-def test_terms_of_several_types_are_summed_together(env):
-    types = torch.bool, torch.int64, torch.float64, torch.float32
-    env.values = {k: torch.tensor([0, 1, 1, 0]).to(dtype) for k, dtype in enumerate(types)}
-    manager = RewardManager({str(k): term(k, 2.0**k) for k in env.values}, env, scale_by_dt=False)
-    assert manager.compute(0.02).tolist() == [0.0, 15.0, 15.0, 0.0]
-
-
 def test_values_of_terms_are_not_written_to(env):
     env.values = {"a": torch.tensor([1.0, torch.nan, 3.0, 4.0])}
     before = env.values["a"].clone()

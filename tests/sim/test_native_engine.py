@@ -11,10 +11,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mujoco.batch import DATA_FIELDS
+from mujoco.batch import DATA_FIELDS, Batch, SimulationError
 
 from mjlab.sim import MujocoCfg, Simulation, SimulationCfg
 from mjlab.sim.engine import ACCELERATION_FIELDS, INPUTS, VELOCITY_FIELDS
+from mjlab.sim.native.engine import NativeEngine
 
 from .parity_models import MODELS
 
@@ -126,7 +127,7 @@ def test_a_model_field_that_is_not_written_keeps_its_double_precision() -> None:
 @pytest.mark.parametrize("engine", ["native", "warp"])
 @pytest.mark.parametrize("guarded", [False, True])
 def test_recorded_substeps_are_those_of_single_steps(engine: str, guarded: bool, tmp_path) -> None:
-    fields = ("sensordata", "qpos", "xmat")
+    fields = ("sensordata", "qpos", "xmat", "time")
     sims = []
     for _ in range(2):
         cfg = SimulationCfg(engine=engine, mujoco=MujocoCfg(timestep=0.004))
@@ -160,6 +161,29 @@ def test_an_environment_that_warns_goes_on_while_its_substeps_are_recorded() -> 
     assert together._engine._batch.warning[1, int(mujoco.mjtWarning.mjWARN_BADCTRL)].any()
     assert (recorded[1:, 1, 2] < recorded[:-1, 1, 2]).all(), "the trunk has to keep falling"
     assert torch.equal(together.data.qpos, one_by_one.data.qpos)
+
+
+def test_an_environment_in_which_mujoco_raises_does_not_touch_those_recorded_beside_it(
+    monkeypatch,
+) -> None:
+    """The rollout has to be told that MuJoCo raised; single steps then find out for themselves."""
+    together, one_by_one = build(), build()
+    batch, failed = together._engine._batch, []
+
+    def rollout(nstep: int, record: tuple[str, ...]) -> None:
+        batch.state[:] += 0.1  # What it left behind must not count.
+        failed.append(nstep)
+        raise SimulationError(np.array([1]), "mj_stackAlloc: out of memory")
+
+    monkeypatch.setattr(batch, "rollout", rollout)
+    for sim in (together, one_by_one):
+        sim.data.qvel[:, 0] = torch.tensor([0.0, 0.5, 1.0])
+    recorded = together.step(4, ("qpos", "sensordata"))
+    assert failed == [4]
+    for k in range(4):
+        one_by_one.step()
+        for name, values in recorded.items():
+            assert torch.equal(values[k], getattr(one_by_one.data, name)), name
 
 
 def test_no_substeps_change_nothing() -> None:
@@ -266,6 +290,35 @@ BOX = """
   </worldbody>
 </mujoco>
 """
+
+
+def test_a_batch_that_keeps_the_data_of_its_simulations_gives_the_same_bits(monkeypatch) -> None:
+    """Models with sleep have such a batch, which goes on from stages that are already there."""
+    plain = build()
+    with monkeypatch.context() as patched:
+        patched.setattr(
+            NativeEngine,
+            "_make_batch",
+            lambda self, model, count, threads=None: Batch(model, count, 1, persistent=True),
+        )
+        kept = build()
+    assert kept._engine._batch.persistent
+    assert not plain._engine._batch.persistent
+    ids = torch.tensor([1])
+    for sim in (plain, kept):
+        _ = sim.data.sensordata, sim.data.xpos, sim.data.cvel, sim.data.qacc
+        sim.data.qvel[:, 0] = torch.tensor([0.0, 0.5, 1.0])
+    for k in range(6):
+        for sim in (plain, kept):
+            sim.data.ctrl[:] = 0.1 * k
+            if k == 3:
+                sim.reset(ids)
+                sim.data.qpos[1, 2] = 0.1
+            sim.step(4, ("sensordata",) if k % 2 else ())
+            sim.forward(stage="vel")
+            sim.forward(ids)
+        for name in ("qpos", "qvel", "sensordata", "xpos", "cvel", "qacc"):
+            assert torch.equal(getattr(plain.data, name), getattr(kept.data, name)), (k, name)
 
 
 def test_a_model_with_sleep_steps_as_plain_mujoco_does() -> None:

@@ -365,6 +365,8 @@ def test_jacobian_agrees_with_mujoco():
     mujoco.mj_jac(sim.mj_model, sim.mj_data, jacp, jacr, points[0].numpy().astype(float), ball)
     np.testing.assert_allclose(translational[3], jacp, atol=1e-6)
     np.testing.assert_allclose(rotational[3], jacr, atol=1e-6)
+    doubles = sim.jacobian(points.double(), torch.full((4,), ball))
+    torch.testing.assert_close(doubles, (translational, rotational))
 
 
 def test_the_host_copy_includes_writes_not_yet_stepped():
@@ -441,6 +443,9 @@ def test_options_are_written_and_unknown_ones_listed():
         MujocoCfg(disableflags=("contacts",)).apply(model)
     with pytest.raises(ValueError, match=r"solver: 'magic'.*newton"):
         MujocoCfg(solver="magic").apply(model)  # ty: ignore
+    for wrong in (mujoco.mjtCone.mjCONE_ELLIPTIC, 1, None, ("pyramidal", "elliptic")):
+        with pytest.raises(ValueError, match=r"MujocoCfg.cone: .*pyramidal, elliptic"):
+            MujocoCfg(cone=wrong).apply(model)  # ty: ignore
 
 
 def test_an_older_flag_is_accepted_with_a_warning():

@@ -26,7 +26,7 @@ from mjlab.sim.randomization import expand_model_fields
 from mjlab.sim.sim_data import TorchArray, WarpBridge
 from mjlab.sim.warp.engine import WarpEngine, offered_data_fields
 
-from .parity_models import CARTPOLE, EQUALITIES, HINGE_CHAIN, LANDING_BOX, MOCAP
+from .parity_models import CARTPOLE, HINGE_CHAIN, LANDING_BOX, MOCAP, MODELS
 
 TWO_JOINTS = """
 <mujoco>
@@ -151,7 +151,7 @@ def test_a_data_field_that_is_not_offered_says_why(field: str, said: str) -> Non
 # Fields.
 
 
-@pytest.mark.parametrize("xml", [LANDING_BOX, EQUALITIES])
+@pytest.mark.parametrize("xml", MODELS.values(), ids=MODELS)
 def test_every_data_field_that_is_offered_has_the_shape_that_mujoco_gives_it(xml: str) -> None:
     engine, host = make_engine(xml, num_envs=3), mujoco.MjData(mujoco.MjModel.from_xml_string(xml))
     mujoco.mj_forward(engine.mj_model, host)

@@ -67,7 +67,7 @@ class CommandTerm(ManagerTermBase):
         self.metrics: dict[str, torch.Tensor] = {}
         self.time_left = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self.command_counter = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
-        self._due = Lookup()
+        self._due_lookup = Lookup()
 
     @property
     def command(self) -> Any:
@@ -85,7 +85,7 @@ class CommandTerm(ManagerTermBase):
         """
         if env_ids is None:
             self._update_metrics()
-            due = self._due.take(self.time_left, dt)
+            due = self._due_lookup.take(self.time_left, dt)
             self.time_left -= dt
             if due is None:
                 due = (self.time_left <= 0.0).nonzero().flatten()
@@ -103,11 +103,12 @@ class CommandTerm(ManagerTermBase):
         self._update_command(env_ids)
 
     def plan_lookups(self, dt: float | torch.Tensor) -> list[Lookup]:
-        """Plan the look-ups of `compute(dt)` for `look_up`, which is optional, and return them.
+        """Plan the look-ups of `compute(dt)`, which `env.step` makes on a GPU, and return them.
 
-        A subclass may add those of its `_update_command`.
+        Without them, `compute` looks up by itself. A subclass may add those of its
+        `_update_command`.
         """
-        return [self._due.plan(self.time_left - dt <= 0.0, self.time_left, dt)]
+        return [self._due_lookup.plan(self.time_left - dt <= 0.0, self.time_left, dt)]
 
     def reset(self, env_ids: torch.Tensor | slice | None) -> dict[str, float]:
         """Draw new commands in these environments, and return and zero the mean of each metric.

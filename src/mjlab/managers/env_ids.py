@@ -18,7 +18,7 @@ def as_ids(env_ids: EnvIds, num_envs: int, device: str) -> torch.Tensor:
         return torch.arange(num_envs, device=device)[as_index(env_ids)]
     if env_ids.dtype == torch.bool:
         return env_ids.nonzero().flatten()
-    return env_ids
+    return env_ids.long()
 
 
 def is_empty(env_ids: EnvIds) -> bool:

@@ -144,7 +144,7 @@ class EventManager(TermFunctionSwitches, TermListManager):
             self._env.sim.recompute_constants(level, reset_ids)
 
     def plan_lookups(self, dt: float) -> list[Lookup]:
-        """Plan the look-ups of `apply("interval", dt=dt)` for `look_up`, which is optional."""
+        """Plan the look-ups of `apply("interval", dt=dt)`; see `CommandTerm.plan_lookups`."""
         return [
             self._lookups[name].plan(timer - dt < _TIMER_TOLERANCE, timer, dt)
             for name, timer in self._timers.items()

@@ -47,7 +47,7 @@ class Lookup:
 
 
 def look_up(lookups: Sequence[Lookup]) -> None:
-    """Find the ids of planned look-ups on a GPU, waiting for it once; for none, do nothing."""
+    """Find the ids of planned look-ups, waiting for the GPU once. All masks are on a GPU."""
     if not lookups:
         return
     masks = torch.stack([lookup.mask for lookup in lookups])

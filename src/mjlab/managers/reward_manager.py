@@ -15,7 +15,6 @@ from mjlab.managers.debug_vis import TermFunctionSwitches
 from mjlab.managers.env_ids import as_index, is_empty
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
 from mjlab.managers.unready_term import UnreadyTerm
-from mjlab.utils.torch import constant_tensor
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -46,7 +45,7 @@ class RewardManager(TermFunctionSwitches, TermListManager):
 
     _cfg_type = RewardTermCfg
     # Views of `_rates`.
-    _transient = {"_step_reward", "_rows", "_none", "_scale_by_dt"}
+    _transient = {"_step_reward", "_rows", "_scale_by_dt"}
 
     def __init__(
         self,
@@ -63,7 +62,6 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         self._episode_sums = torch.zeros(size, dtype=torch.float32, device=self.device)
         self._reward_buf = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._rows = list(self._rates)
-        self._none = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         # Weighted rates (num_envs, terms) of the last step, not multiplied by its duration.
         self._step_reward = self._rates.t()
 
@@ -73,17 +71,13 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         A term that is NaN or infinite in an environment counts as 0 there. Raises `ValueError`
         if a term returns another shape than (num_envs,).
         """
-        values, weights = [], []
-        for name, cfg in zip(self._term_names, self._term_cfgs, strict=True):
-            value = self._none
-            if cfg.weight != 0.0:
-                value = cfg.func(self._env, **cfg.params)
-                self._check_value(name, value)
-            values.append(value)
-            weights.append((float(cfg.weight),))
-        if values:
-            torch.stack(values, out=self._rates)
-            self._rates.mul_(constant_tensor(tuple(weights), self.device))
+        for name, cfg, row in zip(self._term_names, self._term_cfgs, self._rows, strict=True):
+            if cfg.weight == 0.0:
+                row.zero_()
+                continue
+            value = cfg.func(self._env, **cfg.params)
+            self._check_value(name, value)
+            torch.mul(value, cfg.weight, out=row)
         torch.nan_to_num_(self._rates, nan=0.0, posinf=0.0, neginf=0.0)
         scale = dt if self._scale_by_dt else 1.0
         self._episode_sums.add_(self._rates, alpha=scale)

@@ -54,16 +54,17 @@ class MujocoCfg:
         Raises:
             ValueError: an option or flag that MuJoCo does not know, with those it does.
         """
-        from mjlab.utils.mujoco import OPTION_ENUMS, enum_value
+        from mjlab.utils.mujoco import OPTION_ENUMS, enum_bits, enum_value
 
         for option in fields(MujocoCfg):
             name, value = option.name, getattr(self, option.name)
             if name == "enableflags":
                 value = tuple(flag for flag in value if flag not in ALWAYS_ENABLED_FLAGS)
-            if name in OPTION_ENUMS:
-                value = enum_value(f"MujocoCfg.{name}", value, *OPTION_ENUMS[name])
             if name.endswith("flags"):
-                value |= getattr(model.opt, name)
+                bits = enum_bits(f"MujocoCfg.{name}", value, *OPTION_ENUMS[name])
+                value = getattr(model.opt, name) | bits
+            elif name in OPTION_ENUMS:
+                value = enum_value(f"MujocoCfg.{name}", value, *OPTION_ENUMS[name])
             setattr(model.opt, name, value)
 
 
@@ -98,7 +99,7 @@ class SimulationCfg:
         """Write the Warp-only options onto `mujoco_warp`'s `Option`."""
         import warnings
 
-        from mjlab.utils.mujoco import enum_value
+        from mjlab.utils.mujoco import enum_bits, enum_value
 
         if self.ls_parallel is not None:
             warnings.warn(
@@ -107,7 +108,7 @@ class SimulationCfg:
                 stacklevel=2,
             )
         wp_opt.contact_sensor_maxmatch = self.contact_sensor_maxmatch
-        for name in ("broadphase", "broadphase_filter"):
+        for name, read in (("broadphase", enum_value), ("broadphase_filter", enum_bits)):
             value, enum = getattr(self, name), type(getattr(wp_opt, name))
             if value is not None:
-                setattr(wp_opt, name, enum(enum_value(f"SimulationCfg.{name}", value, enum)))
+                setattr(wp_opt, name, enum(read(f"SimulationCfg.{name}", value, enum)))

@@ -97,7 +97,7 @@ class RayQuery:
     """R world-frame rays in each of N environments."""
 
     origins: torch.Tensor
-    """(N, R, 3) metres."""
+    """(N, R, 3), in m."""
     directions: torch.Tensor
     """(N, R, 3) unit vectors."""
     geom_groups: tuple[int, ...] | None = None
@@ -105,7 +105,7 @@ class RayQuery:
     exclude_body_ids: torch.Tensor | None = None
     """(R,) int32 body whose own geoms are ignored, -1 for none."""
     max_distances: torch.Tensor | None = None
-    """(R,) metres; what is farther away is a miss. None for no limit."""
+    """(R,), in m; what is farther away is a miss. None for no limit."""
 
 
 RayHits = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
@@ -313,9 +313,9 @@ class Engine(ABC):
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:
         """Render what cameras of the model see, at the poses that derived fields have.
 
-        A ray through the centre of each pixel meets the nearest surface of a geom of the view's
-        groups, fully transparent or not: planes from above, height fields from above, and other
-        geoms from outside. Its colour is that of its geom or material, times the texture, times
+        A ray through the center of each pixel meets the nearest surface of a geom of the view's
+        groups that is not fully transparent: planes from above, height fields from above, and other
+        geoms from outside. Its color is that of its geom or material, times the texture, times
         the light that falls on it. Beyond the model's far limit (`vis.map.zfar`), and where there
         is nothing, colours are those of the skybox, or black.
 

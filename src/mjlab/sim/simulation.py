@@ -457,15 +457,15 @@ class Simulation:
         A degree of freedom with motion axis (w, v) at the center of mass c of the body's tree moves
         a point p with v + w x (p - c).
         """
-        # Not `Batch.jac`, which belongs to the present qpos: in the middle of a step that is one
-        # substep newer than the positions that the points come from.
+        # Not by the engine from the present qpos, which in the middle of a step is one substep newer
+        # than the positions that the points come from.
         roots, moves = self._body_motion
         body_ids = body_ids.long()
         envs = torch.arange(self.num_envs, device=self.device)
         centers = self.data.subtree_com[envs, roots[body_ids]]
         axes = self.data.cdof * moves[body_ids][..., None]
         rotational, translational = axes.split(3, dim=-1)
-        arms = (points - centers)[:, None].expand_as(rotational)
+        arms = (points.float() - centers)[:, None].expand_as(rotational)
         translational = translational + torch.linalg.cross(rotational, arms)
         return translational.mT, rotational.mT
 

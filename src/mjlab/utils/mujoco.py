@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Iterable
 from typing import Any, Literal
 
@@ -32,21 +34,25 @@ OPTION_ENUMS = {
 """Options whose values are members of an enum (flags: bits), with the prefix of the members."""
 
 
-def enum_value(option: str, value: str | tuple[str, ...], enum: Any, prefix: str = "") -> int:
-    """Return an enum's member for a lower-case name, or the bits of several names.
+def enum_value(option: str, name: Any, enum: Any, prefix: str = "") -> int:
+    """Return an enum's member for a lower-case name.
 
     Raises:
         ValueError: an unknown name, with the valid ones. `option` says where it was given.
     """
     members = _members(enum, prefix)
-    bits = 0
-    for name in (value,) if isinstance(value, str) else value:
-        if name not in members:
-            raise ValueError(
-                f"{option}: {name!r} is not known to MuJoCo. Choose from: {', '.join(members)}."
-            )
-        bits |= members[name]
-    return bits
+    if name not in members:
+        raise ValueError(
+            f"{option}: {name!r} is not known to MuJoCo. Choose from: {', '.join(members)}."
+        )
+    return members[name]
+
+
+def enum_bits(option: str, names: Iterable[str], enum: Any, prefix: str = "") -> int:
+    """Return the bits of several names; see `enum_value`."""
+    return functools.reduce(
+        operator.or_, (enum_value(option, name, enum, prefix) for name in names), 0
+    )
 
 
 def flag_names(option: str, bits: int) -> list[str]:

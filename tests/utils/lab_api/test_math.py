@@ -221,6 +221,13 @@ def test_wrapped_angles_are_the_same_angles(angle):
     assert math.isclose(math.sin(float(wrapped)), math.sin(angle), abs_tol=1e-9)
 
 
+def test_products_of_strided_quaternions_are_contiguous():
+    first, second = torch.randn(2, 5, 3, 4, generator=torch.Generator().manual_seed(0))
+    product = m.quat_mul(first.transpose(0, 1), second.transpose(0, 1))
+    assert product.is_contiguous()
+    assert torch.equal(product, m.quat_mul(first, second).transpose(0, 1))
+
+
 def test_odd_multiples_of_pi_keep_their_sign():
     pi = math.pi
     wrapped = m.wrap_to_pi(torch.tensor([pi, -pi, 0.0], dtype=torch.float64))

@@ -8,6 +8,7 @@ computed are copied out. A field costs time only once it is read.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import logging
@@ -279,14 +280,19 @@ class NativeEngine(Engine):
         one substep a call, as all do where MuJoCo raises: the same bits, at 1.08 of the time.
         """
         warnings = self._batch.warning.copy()
-        try:
-            values = self._batch.rollout(nstep, record=tuple(recorded))
-        except SimulationError:
-            again = np.ones(self.num_envs, dtype=bool)
-        else:
-            for name, after in recorded.items():
-                after.copy_(_like_mujoco(name, _as_tensor(values[name]).transpose(0, 1)))
-            again = (self._batch.warning != warnings).reshape(self.num_envs, -1).any(axis=1)
+        # `time` is no array in `MjData`, and `Batch` records it as a part of the state.
+        items = {
+            name: mujoco.mjtState.mjSTATE_TIME if name == "time" else name for name in recorded
+        }
+        again = np.ones(self.num_envs, dtype=bool)
+        # Which trees sleep could not be put back.
+        if not self._batch.persistent:
+            with contextlib.suppress(SimulationError):
+                values = self._batch.rollout(nstep, record=tuple(items.values()))
+                for name, after in recorded.items():
+                    value = _like_mujoco(name, _as_tensor(values[items[name]]).transpose(0, 1))
+                    after.copy_(value.reshape(after.shape))
+                again = (self._batch.warning != warnings).reshape(self.num_envs, -1).any(axis=1)
         if not again.any():
             return None
         ids = rows = torch.from_numpy(np.flatnonzero(again))

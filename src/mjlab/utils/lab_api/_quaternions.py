@@ -33,7 +33,7 @@ def quat_mul(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
     x -= zy
     y += zx
     z += zw
-    return product
+    return product.contiguous()
 
 
 def quat_conjugate(q: torch.Tensor) -> torch.Tensor:
