@@ -94,7 +94,8 @@ class ManagerBasedRlEnv:
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=device)
         self._pending_reset = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
         self._nan_resets = torch.zeros(self.num_envs, dtype=torch.long, device=device)
-        # What `_command_dt` returns in a step with resets.
+        # What `_command_dt` returns in a step with resets. Kept, because torch counts no writes to a
+        # tensor made under `inference_mode`, and by these a `Lookup` knows that it is valid.
         self._command_dts = torch.zeros(self.num_envs, dtype=torch.float32, device=device)
         self._ended = Lookup()
         self._looks_ahead = torch.device(device).type == "cuda"

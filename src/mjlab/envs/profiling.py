@@ -21,8 +21,11 @@ if TYPE_CHECKING:
 
 # Methods of the simulation and the scene that a step calls, and the phase that each belongs to.
 _SIMULATION = {
-    **{"step": "physics", "forward": "forward", "forward_after_reset": "forward"},
-    **{"sense": "sense", "reset": "reset"},
+    "step": "physics",
+    "forward": "forward",
+    "forward_after_reset": "forward",
+    "sense": "sense",
+    "reset": "reset",
 }
 _SCENE = {"write_data_to_sim": "actuators", "update": "sensors", "reset": "reset"}
 # Methods of each manager that a step calls; the phase is named after the manager.
