@@ -83,6 +83,66 @@ class RslRlPpoAlgorithmCfg:
 
 
 @dataclass
+class RslRlSacAlgorithmCfg:
+    """Soft actor-critic with distributional critics, from a replay (`mjlab.rl.sac`).
+
+    The defaults are FastSAC's (Seo et al., arXiv 2512.01996), made smaller for a few cores.
+    """
+
+    batch_size: int = 2048
+    """Transitions of an update; mirror images count."""
+    num_updates: int = 4
+    """Updates for each environment step of all environments. Times `batch_size`, by the number of
+    environments, this is how often a transition is used (the replay ratio)."""
+    replay_steps: int = 500
+    """Last steps of each environment that are kept to learn from."""
+    learning_starts: int = 10
+    """Environment steps before the first update."""
+    gamma: float = 0.97
+    """Discount factor per environment step."""
+    num_steps_return: int = 1
+    """Steps over which rewards are summed before the critics' prediction takes their place."""
+    value_range: tuple[float, float] | None = None
+    """Smallest and largest discounted return that the critics can tell apart. None: rewards are
+    divided by the scale of the returns seen so far."""
+    num_atoms: int = 101
+    """Values that a critic tells apart within the range."""
+    tau: float = 0.05
+    """Share by which target critics follow the critics in an update."""
+    pessimistic: bool = False
+    """Take the smaller of both critics' predictions, instead of their mean."""
+    policy_delay: int = 4
+    """Updates of the critics for one of the policy."""
+    actor_learning_rate: float = 3e-4
+    """Learning rate of the policy."""
+    critic_learning_rate: float = 3e-4
+    """Learning rate of the critics."""
+    weight_decay: float = 1e-3
+    """Decay of weights (AdamW)."""
+    init_alpha: float = 1e-3
+    """Weight of the entropy, before any learning."""
+    alpha_learning_rate: float = 3e-4
+    """Learning rate of the logarithm of that weight."""
+    alpha_range: tuple[float, float] = (1e-5, 1.0)
+    """Smallest and largest weight of the entropy."""
+    target_std: float = 0.15
+    """Deviation of each action, before tanh, to whose entropy that of the policy is held."""
+    noise_hold: int = 1
+    """Most steps for which an environment keeps its exploration noise; 1 draws it at every step."""
+    symmetry_cfg: dict[str, Any] | None = None
+    """Learning from mirror images too, as for PPO: `{"data_augmentation_func": "module:function"}`.
+    Half of each batch are then mirror images."""
+    use_mixed_precision: bool = False
+    """Whether networks compute in bfloat16 while learning. On CPUs that have AVX-512-bf16 or AMX this
+    takes two thirds of the time."""
+    save_replay: bool = True
+    """Whether the replay is written beside the newest checkpoint. Without it, a resumed run learns from
+    new steps only."""
+    class_name: str = "mjlab.rl.sac:SAC"
+    """A class of rsl_rl, or `module:Class`."""
+
+
+@dataclass
 class EvaluationCfg:
     """What counts as solved, and when training stops to look.
 
@@ -187,4 +247,40 @@ class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
     critic: RslRlModelCfg = field(default_factory=RslRlModelCfg)
     """The value network."""
     algorithm: RslRlPpoAlgorithmCfg = field(default_factory=RslRlPpoAlgorithmCfg)
+    """The learning algorithm."""
+
+
+def squashed_gaussian(init_std: float = 0.15, log_std_max: float = 0.0) -> dict[str, Any]:
+    """Return a `distribution_cfg`: normal, through tanh, with deviations that the network gives."""
+    return {
+        "class_name": "mjlab.rl.sac_models:SquashedGaussian",
+        "init_std": init_std,
+        "log_std_range": (-5.0, log_std_max),
+    }
+
+
+@dataclass
+class RslRlOffPolicyRunnerCfg(RslRlBaseRunnerCfg):
+    """A training run with an off-policy algorithm. Actions are in (-1, 1)."""
+
+    actor: RslRlModelCfg = field(
+        default_factory=lambda: RslRlModelCfg(
+            class_name="mjlab.rl.sac_models:SacActorModel",
+            hidden_dims=(256, 128, 64),
+            activation="swish",
+            obs_normalization=True,
+            distribution_cfg=squashed_gaussian(),
+        )
+    )
+    """The policy network."""
+    critic: RslRlModelCfg = field(
+        default_factory=lambda: RslRlModelCfg(
+            class_name="mjlab.rl.sac_models:TwinCriticModel",
+            hidden_dims=(256, 128, 64),
+            activation="swish",
+            obs_normalization=True,
+        )
+    )
+    """Both critics."""
+    algorithm: RslRlSacAlgorithmCfg = field(default_factory=RslRlSacAlgorithmCfg)
     """The learning algorithm."""

@@ -123,8 +123,13 @@ with _import_context:
     from rsl_rl.models import CNNModel as CNNModel
     from rsl_rl.models import MLPModel as MLPModel
     from rsl_rl.modules import CNN as CNN
+    from rsl_rl.modules.distribution import Distribution as Distribution
     from rsl_rl.runners import OnPolicyRunner as OnPolicyRunner
     from rsl_rl.utils import check_nan as check_nan
+    from rsl_rl.utils import reduce_gradients_in_buckets as reduce_gradients_in_buckets
     from rsl_rl.utils import resolve_callable as resolve_callable
+    from rsl_rl.utils import resolve_class as resolve_class
+    from rsl_rl.utils import resolve_nn_activation as resolve_nn_activation
+    from rsl_rl.utils import resolve_obs_groups as resolve_obs_groups
     from rsl_rl.utils.logger import Logger as Logger
     from tensordict import TensorDict as TensorDict

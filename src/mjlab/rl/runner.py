@@ -274,6 +274,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     def _resolve_threads(self) -> int:
         if torch.device(self.device).type != "cpu":
             return torch.get_num_threads()
+        # An algorithm that learns beside the physics says how many it leaves.
+        if (own := getattr(self.alg, "num_threads", None)) is not None:
+            return own
         parameters = sum(
             parameter.numel()
             for group in self.alg.optimizer.param_groups

@@ -1,0 +1,499 @@
+"""Soft actor-critic over thousands of environments: learns beside the physics, from a replay.
+
+The algorithm is that of Haarnoja et al. (arXiv 1812.05905), with what makes it work in massively
+parallel simulation (FastSAC, Seo et al., arXiv 2512.01996; FlashSAC, arXiv 2604.04539): large batches,
+layer normalization, critics that predict distributions, little noise at first, and noise that is held for
+several steps.
+
+On the CPU one core steps the physics while another learns. They work in lock step: the updates that
+belong to one environment step see what was stored before it began, and the next step's actions wait for
+them. So the same seed gives the same weights, bit for bit, whichever core is faster.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import torch
+from torch import nn
+
+from mjlab.rl.replay import Batch, ReplayStorage
+from mjlab.rl.rsl import (
+    TensorDict,
+    VecEnv,
+    reduce_gradients_in_buckets,
+    resolve_callable,
+    resolve_class,
+    resolve_obs_groups,
+)
+from mjlab.rl.sac_models import SacActorModel, SquashedGaussian, TwinCriticModel
+
+# Of returns whose scale is estimated, where no range of values is given.
+_SCALED_RANGE = (-5.0, 5.0)
+
+
+class SAC:
+    """Soft actor-critic, as rsl_rl's runners drive an algorithm.
+
+    `act`, `process_env_step`: once for each environment step. `update` only reports what was learned
+    in the steps since it was called before.
+    """
+
+    takes_final_observations = True
+    rnd = None
+
+    def __init__(
+        self,
+        actor: SacActorModel,
+        critic: TwinCriticModel,
+        storage: ReplayStorage,
+        num_envs: int,
+        *,
+        gamma: float,
+        num_steps_return: int,
+        tau: float,
+        batch_size: int,
+        num_updates: int,
+        policy_delay: int,
+        learning_starts: int,
+        actor_learning_rate: float,
+        critic_learning_rate: float,
+        weight_decay: float,
+        init_alpha: float,
+        alpha_learning_rate: float,
+        alpha_range: tuple[float, float],
+        target_std: float,
+        pessimistic: bool,
+        noise_hold: int,
+        scales_rewards: bool,
+        mirror: Any = None,
+        env: Any = None,
+        use_mixed_precision: bool = False,
+        learns_beside_physics: bool = False,
+        device: str = "cpu",
+        multi_gpu_cfg: dict | None = None,
+        grad_reduce_bucket_mb: float = 25,
+    ) -> None:
+        self.device = device
+        self.actor, self.critic = actor.to(device), critic.to(device)
+        self._raw_actor, self._raw_critic = self.actor, self.critic
+        # Acts, and is what others see: it changes between two environment steps only.
+        self._policy = copy.deepcopy(self.actor).requires_grad_(False)
+        self._target = copy.deepcopy(self.critic).requires_grad_(False)
+        self.storage = storage
+        self.gamma, self._num_steps_return, self._tau = gamma, num_steps_return, tau
+        self._batch_size, self._num_updates = batch_size, num_updates
+        self._policy_delay, self._learning_starts = policy_delay, learning_starts
+        self._pessimistic = pessimistic
+        self._log_alpha = nn.Parameter(torch.tensor(math.log(init_alpha), device=device))
+        self._log_alpha_range = (math.log(alpha_range[0]), math.log(alpha_range[1]))
+        num_actions = actor.distribution.output_dim
+        self._target_entropy = num_actions * math.log(target_std * math.sqrt(2 * math.pi * math.e))
+        groups = [
+            {"params": list(self.critic.parameters()), "lr": critic_learning_rate},
+            {"params": list(self.actor.parameters()), "lr": actor_learning_rate},
+            {"params": [self._log_alpha], "lr": alpha_learning_rate, "weight_decay": 0.0},
+        ]
+        # Fused: one call for all parameters, a quarter of the time. The second moments forget sooner
+        # than usual, because targets move (arXiv 2512.01996).
+        self.optimizer = torch.optim.AdamW(
+            groups, betas=(0.9, 0.95), weight_decay=weight_decay, fused=True
+        )
+        self.learning_rate = actor_learning_rate
+        self._mirror, self._env = mirror, env
+        self._use_mixed_precision = use_mixed_precision
+        self._multi_gpu, self._bucket_mb = multi_gpu_cfg, grad_reduce_bucket_mb
+
+        self._generator = torch.Generator(device=device)
+        self._generator.manual_seed(torch.initial_seed() % 2**63)
+        self._noise = _HeldNoise(num_envs, num_actions, noise_hold, device)
+        self._reward_scale = _ReturnScale(num_envs, gamma, device) if scales_rewards else None
+        self._num_steps = self._num_updates_made = 0
+        self._actions = torch.zeros(num_envs, num_actions, device=device)
+        self._started = False
+        # Of updates that are waited for, and of those before.
+        self._figures: list[dict[str, torch.Tensor]] = []
+        self._finished: list[dict[str, torch.Tensor]] = []
+        self._thread: ThreadPoolExecutor | None = None
+        self._running: Future[None] | None = None
+        if learns_beside_physics:
+            # A core to itself: more threads would wait for those of the physics.
+            self._thread = ThreadPoolExecutor(1, "learner", lambda: torch.set_num_threads(1))
+            self.num_threads = 1
+
+    # Acting.
+
+    def act(self, obs: TensorDict) -> torch.Tensor:
+        """Return actions (N, A), with exploration."""
+        if not self._started:
+            self.storage.start(obs)
+            self._started = True
+        distribution = _of(self._policy)
+        distribution.update(self._policy.mlp(self._policy.get_latent(obs)))
+        self._actions = distribution.action_of(self._noise.draw())
+        return self._actions
+
+    def process_env_step(
+        self, obs: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict[str, Any]
+    ) -> None:
+        """Store a step, take over what was learned meanwhile, and begin to learn from it."""
+        self._wait()
+        # Rollouts run in inference mode, and tensors made in it cannot be changed outside.
+        with torch.inference_mode(False), torch.no_grad():
+            self.storage.add(
+                self._actions,
+                rewards,
+                dones,
+                extras.get("time_outs"),
+                obs,
+                extras.get("final_ids"),
+                extras.get("final_observations"),
+            )
+            for model in (self.actor, self.critic):
+                model.update_normalization(obs)
+            if self._reward_scale is not None:
+                self._reward_scale.update(rewards, dones)
+            _copy_parameters(self.actor, self._policy)
+        self._num_steps += 1
+        if self._num_steps < self._learning_starts:
+            return
+        if self._thread is not None:
+            self._running = self._thread.submit(self._learn)
+            return
+        with torch.inference_mode(False), torch.enable_grad():
+            self._learn()
+
+    def compute_returns(self, obs: TensorDict) -> None:
+        """Do nothing: there are no returns of whole episodes."""
+
+    def update(self) -> dict[str, float]:
+        """Return means over the updates that were finished since the last call."""
+        figures, self._finished = self._finished, []
+        return {
+            name: torch.stack([one[name] for one in figures if name in one]).mean().item()
+            for name in sorted(set().union(*figures))
+        }
+
+    def _wait(self) -> None:
+        """Wait until what is being learned is learned; raise what went wrong with it."""
+        running, self._running = self._running, None
+        if running is not None:
+            running.result()
+        self._finished += self._figures
+        self._figures = []
+
+    # Learning.
+
+    def _learn(self) -> None:
+        """Make the updates of one environment step, from one sample of the replay."""
+        parts = 1 if self._mirror is None else 2
+        size = self._num_updates * self._batch_size // parts
+        batch = self.storage.sample(size, self.gamma, self._num_steps_return, self._generator)
+        if self._reward_scale is not None:
+            batch.returns *= self._reward_scale.factor
+        inputs = self._prepare(batch)
+        for rows in torch.arange(size * parts, device=self.device).view(
+            parts, self._num_updates, -1
+        ).transpose(0, 1).flatten(1):  # fmt: skip
+            self._update({name: value[rows] for name, value in inputs.items()})
+
+    def _prepare(self, batch: Batch) -> dict[str, torch.Tensor]:
+        """Return what updates need of a batch, with mirror images appended, observations normalized."""
+        before, after, actions = batch.observations, batch.next_observations, batch.actions
+        weights, returns, discounts = batch.weights, batch.returns, batch.discounts
+        if self._mirror is not None:
+            before, actions = self._mirror(env=self._env, obs=before, actions=actions)
+            after, _ = self._mirror(env=self._env, obs=after, actions=None)
+            returns, discounts, weights = (
+                value.repeat(2) for value in (returns, discounts, weights)
+            )
+        with torch.no_grad():
+            return {
+                "actor": self.actor.get_latent(before),
+                "critic": self.critic.get_latent(before),
+                "next_actor": self.actor.get_latent(after),
+                "next_critic": self.critic.get_latent(after),
+                "actions": actions,
+                "returns": returns,
+                "discounts": discounts,
+                "weights": weights,
+            }
+
+    def _update(self, inputs: dict[str, torch.Tensor]) -> None:
+        self.optimizer.zero_grad(set_to_none=True)
+        figures = self._critic_gradients(inputs)
+        self._num_updates_made += 1
+        if self._num_updates_made % self._policy_delay == 0:
+            figures |= self._actor_gradients(inputs)
+        if self._multi_gpu is not None:
+            self._reduce_gradients()
+        self.optimizer.step()
+        with torch.no_grad():
+            self._log_alpha.clamp_(*self._log_alpha_range)
+            for target, source in zip(
+                self._target.parameters(), self.critic.parameters(), strict=True
+            ):
+                target.lerp_(source, self._tau)
+        self._figures.append(figures)
+
+    def _critic_gradients(self, inputs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Let both critics predict y = R + discount (Q'(s', a') - alpha log p(a' | s'))."""
+        with torch.no_grad(), self._autocast():
+            actions, log_prob = self._sample(inputs["next_actor"])
+            values = self._target.values(inputs["next_critic"], actions)
+            value = values.amin(dim=0) if self._pessimistic else values.mean(dim=0)
+            value = value - self._log_alpha.exp() * log_prob
+            target = inputs["returns"] + inputs["discounts"] * value
+            wanted = self.critic.distribution_of(target)
+        with self._autocast():
+            logits = self.critic.logits(inputs["critic"], inputs["actions"])
+        losses = [-(wanted * torch.log_softmax(one, dim=-1)).sum(dim=-1) for one in logits]
+        loss = sum((loss * inputs["weights"]).mean() for loss in losses)
+        assert isinstance(loss, torch.Tensor)
+        loss.backward()
+        # Mass in the end atoms says that the range of values is too narrow.
+        ends = wanted[:, 0] + wanted[:, -1]
+        return {
+            "critic": loss.detach(),
+            "value": target.mean(),
+            "value_at_range_end": ends.mean(),
+        }
+
+    def _actor_gradients(self, inputs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Let the policy maximize Q(s, a) - alpha log p(a | s), and alpha hold its entropy."""
+        with self._autocast():
+            actions, log_prob = self._sample(inputs["actor"])
+            values = self.critic.values(inputs["critic"], actions)
+        value = values.amin(dim=0) if self._pessimistic else values.mean(dim=0)
+        loss = (self._log_alpha.exp().detach() * log_prob - value).mean()
+        entropy = _of(self.actor).entropy.detach().mean()
+        alpha_loss = self._log_alpha.exp() * (entropy - self._target_entropy)
+        # Not for the critic, whose gradients are those of its own loss.
+        loss.backward(inputs=list(self.actor.parameters()))
+        alpha_loss.backward()
+        return {
+            "actor": loss.detach(),
+            "entropy": entropy,
+            "alpha": self._log_alpha.detach().exp(),
+            "saturated_actions": (actions.detach().abs() > 0.95).float().mean(),
+        }
+
+    def _sample(self, latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        distribution = _of(self.actor)
+        distribution.update(self.actor.mlp(latent))
+        noise = torch.randn(
+            (len(latent), distribution.output_dim), generator=self._generator, device=self.device
+        )
+        return distribution.action_and_log_prob(noise)
+
+    def _autocast(self) -> torch.autocast:
+        kind = torch.device(self.device).type
+        return torch.autocast(kind, torch.bfloat16, enabled=self._use_mixed_precision)
+
+    # Modes, files, processes.
+
+    def train_mode(self) -> None:
+        """Let observation statistics be updated."""
+        self.actor.train()
+        self.critic.train()
+
+    def eval_mode(self) -> None:
+        """Finish learning from the last step, and hold observation statistics."""
+        self._wait()
+        self.actor.eval()
+        self.critic.eval()
+
+    def get_policy(self) -> SacActorModel:
+        """Return the policy that acts."""
+        return self._policy
+
+    def save(self) -> dict[str, Any]:
+        """Return all weights and states but the replay, as plain data."""
+        self._wait()
+        return {
+            "actor_state_dict": self._policy.state_dict(),
+            "critic_state_dict": self.critic.state_dict(),
+            "optimizer_state_dict": self.optimizer.state_dict(),
+            "sac_state_dict": {
+                "actor": self.actor.state_dict(),
+                "target": self._target.state_dict(),
+                "log_alpha": self._log_alpha.detach(),
+                "noise": self._noise.state_dict(),
+                "reward_scale": self._reward_scale.state_dict() if self._reward_scale else None,
+                "generator": self._generator.get_state(),
+                "num_steps": self._num_steps,
+                "num_updates": self._num_updates_made,
+            },
+        }
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
+        """Load what `load_cfg` names (`actor`, `critic`, `optimizer`, `iteration`); None loads all.
+
+        Returns whether the count of iterations is to be loaded.
+        """
+        self._wait()
+        everything = load_cfg is None
+        cfg = dict.fromkeys(("actor", "critic", "optimizer", "iteration"), True)
+        cfg = cfg if load_cfg is None else load_cfg
+        if cfg.get("actor"):
+            for model in (self.actor, self._policy):
+                model.load_state_dict(loaded_dict["actor_state_dict"], strict=strict)
+        if cfg.get("critic"):
+            for model in (self.critic, self._target):
+                model.load_state_dict(loaded_dict["critic_state_dict"], strict=strict)
+        if cfg.get("optimizer"):
+            self.optimizer.load_state_dict(loaded_dict["optimizer_state_dict"])
+            self.learning_rate = self.optimizer.param_groups[1]["lr"]
+        if everything:
+            self._load_state(loaded_dict["sac_state_dict"])
+        return cfg.get("iteration", False)
+
+    def _load_state(self, state: dict[str, Any]) -> None:
+        self.actor.load_state_dict(state["actor"])
+        self._target.load_state_dict(state["target"])
+        with torch.no_grad():
+            self._log_alpha.copy_(state["log_alpha"])
+        self._generator.set_state(state["generator"].cpu())
+        self._num_steps, self._num_updates_made = state["num_steps"], state["num_updates"]
+        self._noise.load_state_dict(state["noise"])
+        if self._reward_scale is not None:
+            self._reward_scale.load_state_dict(state["reward_scale"])
+
+    def broadcast_parameters(self) -> None:
+        """Give all processes the weights of the first."""
+        for model in (self.actor, self.critic):
+            for tensor in model.state_dict().values():
+                torch.distributed.broadcast(tensor, src=0)
+        _copy_parameters(self.actor, self._policy)
+        self._target.load_state_dict(self.critic.state_dict())
+
+    def _reduce_gradients(self) -> None:
+        assert self._multi_gpu is not None
+        parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+        reduce_gradients_in_buckets(parameters, self._multi_gpu["world_size"], self._bucket_mb)
+
+    @staticmethod
+    def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict, device: str) -> SAC:
+        """Build networks and replay from a `RslRlOffPolicyRunnerCfg` as a dict."""
+        alg_class, alg_cfg = resolve_class(cfg["algorithm"])
+        actor_class, actor_cfg = resolve_class(cfg["actor"])
+        critic_class, critic_cfg = resolve_class(cfg["critic"])
+        cfg["obs_groups"] = resolve_obs_groups(obs, cfg["obs_groups"], ["actor", "critic"])
+        actor = actor_class(obs, cfg["obs_groups"], "actor", env.num_actions, **actor_cfg)
+        value_range = alg_cfg.pop("value_range")
+        critic = critic_class(
+            obs,
+            cfg["obs_groups"],
+            "critic",
+            env.num_actions,
+            num_atoms=alg_cfg.pop("num_atoms"),
+            value_range=value_range or _SCALED_RANGE,
+            **critic_cfg,
+        )
+        groups = list(dict.fromkeys([*actor.obs_groups, *critic.obs_groups]))
+        steps = alg_cfg.pop("replay_steps")
+        storage = ReplayStorage(steps, obs.to(device), groups, env.num_actions)
+        symmetry = alg_cfg.pop("symmetry_cfg")
+        mirror = resolve_callable(symmetry["data_augmentation_func"]) if symmetry else None
+        alone = cfg["multi_gpu"] is None
+        alg_cfg.pop("save_replay")
+        return alg_class(
+            actor,
+            critic,
+            storage,
+            env.num_envs,
+            mirror=mirror,
+            env=env,
+            scales_rewards=value_range is None,
+            learns_beside_physics=alone and torch.device(device).type == "cpu",
+            device=device,
+            multi_gpu_cfg=cfg["multi_gpu"],
+            **alg_cfg,
+        )
+
+
+class _HeldNoise:
+    """Standard normal noise (N, A), of which each environment keeps a draw for some steps.
+
+    For how many is drawn from a Zipf distribution, P(k) ~ 1 / k^2 up to a largest k (FlashSAC, arXiv
+    2604.04539). Noise of every step anew averages out before a leg has moved.
+    """
+
+    def __init__(self, num_envs: int, num_actions: int, longest: int, device: str) -> None:
+        self._noise = torch.zeros(num_envs, num_actions, device=device)
+        self._steps_left = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        self._chances = 1.0 / torch.arange(1, longest + 1, device=device).square()
+
+    def draw(self) -> torch.Tensor:
+        due = self._steps_left == 0
+        fresh = torch.randn_like(self._noise)
+        torch.where(due[:, None], fresh, self._noise, out=self._noise)
+        steps = 1 + torch.multinomial(self._chances, len(due), replacement=True)
+        self._steps_left = torch.where(due, steps, self._steps_left) - 1
+        return self._noise
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        return {"noise": self._noise, "steps_left": self._steps_left}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        if state["noise"].shape == self._noise.shape:
+            self._noise = state["noise"].to(self._noise.device).clone()
+            self._steps_left = state["steps_left"].to(self._noise.device).clone()
+
+
+class _ReturnScale:
+    """Factor for rewards by which discounted returns have a deviation of 1 and stay within the range.
+
+    1 / max(std(G), max|G| / 5), over all returns G that environments have run up so far (SimbaV2, Lee
+    et al., arXiv 2502.15280).
+    """
+
+    def __init__(self, num_envs: int, gamma: float, device: str) -> None:
+        self._gamma = gamma
+        self._returns = torch.zeros(num_envs, device=device)
+        self._count, self._mean, self._sum = (torch.zeros((), device=device) for _ in range(3))
+        self._largest = torch.zeros((), device=device)
+        self.factor = torch.ones((), device=device)
+
+    def update(self, rewards: torch.Tensor, dones: torch.Tensor) -> None:
+        self._returns = rewards + self._gamma * self._returns
+        count = self._count + len(rewards)
+        shift = self._returns.mean() - self._mean
+        within = (self._returns - self._returns.mean()).square().sum()
+        self._sum = self._sum + within + shift.square() * self._count * len(rewards) / count
+        self._mean = self._mean + shift * len(rewards) / count
+        self._count = count
+        self._largest = torch.maximum(self._largest, self._returns.abs().max())
+        deviation = (self._sum / count).sqrt()
+        self.factor = 1.0 / torch.maximum(deviation, self._largest / _SCALED_RANGE[1]).clamp(
+            min=1e-6
+        )
+        self._returns = torch.where(dones.bool(), 0.0, self._returns)
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        names = ("_returns", "_count", "_mean", "_sum", "_largest", "factor")
+        return {name: getattr(self, name) for name in names}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        for name, value in state.items():
+            own = getattr(self, name)
+            if value.shape == own.shape:
+                setattr(self, name, value.to(own.device).clone())
+
+
+def _of(model: SacActorModel) -> SquashedGaussian:
+    distribution = model.distribution
+    assert isinstance(distribution, SquashedGaussian)
+    return distribution
+
+
+def _copy_parameters(source: nn.Module, to: nn.Module) -> None:
+    """Copy parameters and statistics from one network to another of the same shape."""
+    with torch.no_grad():
+        for own, other in zip(to.parameters(), source.parameters(), strict=True):
+            own.copy_(other)
+        for own, other in zip(to.buffers(), source.buffers(), strict=True):
+            own.copy_(other)

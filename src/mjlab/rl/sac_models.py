@@ -1,0 +1,208 @@
+"""Networks of the off-policy learner: a squashed Gaussian policy, and two critics of Q values.
+
+Layers are normalized (Ba et al., arXiv 1607.06450), which keeps critics stable that learn from
+their own predictions. A critic predicts the distribution of the return over a fixed row of values
+and is trained by cross-entropy instead of squared errors (Bellemare et al., arXiv 1707.06887;
+Farebrother et al., arXiv 2403.03950).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import nn
+
+from mjlab.rl.rsl import Distribution, MLPModel, TensorDict, resolve_nn_activation
+
+_LOG_2PI = math.log(2.0 * math.pi)
+
+
+class SquashedGaussian(Distribution):
+    """Distribution of actions in (-1, 1): the tanh of a normal variable.
+
+    The network gives mean and standard deviation of u; the action is a = tanh(u). With the change of
+    variables, log p(a) = log N(u; mean, std) - sum_i log(1 - tanh(u_i)^2) (Haarnoja et al., arXiv
+    1801.01290, appendix C). `std` and `entropy` are those of u.
+    """
+
+    def __init__(
+        self,
+        output_dim: int,
+        init_std: float = 0.15,
+        log_std_range: Sequence[float] = (-5.0, 0.0),
+    ) -> None:
+        """Take the number of actions.
+
+        Args:
+            output_dim: Number of actions.
+            init_std: Standard deviation of u, before any learning.
+            log_std_range: Smallest and largest logarithm of the standard deviation.
+
+        Raises:
+            ValueError: `init_std` is not within the range.
+        """
+        super().__init__(output_dim)
+        self._low, self._high = map(float, log_std_range)
+        if not self._low < math.log(init_std) < self._high:
+            raise ValueError(
+                f"SquashedGaussian init_std: expected a number between {math.exp(self._low):.3g} and "
+                f"{math.exp(self._high):.3g}, which log_std_range {tuple(log_std_range)} allows, got "
+                f"{init_std}."
+            )
+        self._init_std = init_std
+        self._mean = self._log_std = torch.zeros(0)
+
+    @property
+    def input_dim(self) -> list[int]:
+        return [2, self.output_dim]
+
+    def init_mlp_weights(self, mlp: nn.Module) -> None:
+        """Begin in the middle of the action range, whatever is observed (Seo et al., 2512.01996)."""
+        last = [layer for layer in mlp.modules() if isinstance(layer, nn.Linear)][-1]
+        share = (math.log(self._init_std) - self._low) / (self._high - self._low)
+        nn.init.zeros_(last.weight)
+        with torch.no_grad():
+            last.bias[: self.output_dim] = 0.0
+            last.bias[self.output_dim :] = math.atanh(2.0 * share - 1.0)
+
+    def update(self, mlp_output: torch.Tensor) -> None:
+        self._mean, raw = mlp_output.float().unbind(dim=-2)
+        # Bounded smoothly, because a clamped value has no gradient that would bring it back.
+        share = 0.5 * (torch.tanh(raw) + 1.0)
+        self._log_std = self._low + (self._high - self._low) * share
+
+    def sample(self) -> torch.Tensor:
+        return self.action_of(torch.randn_like(self._mean))
+
+    def action_of(self, noise: torch.Tensor) -> torch.Tensor:
+        """Return the action (N, A) that standard normal `noise` (N, A) leads to."""
+        return torch.tanh(self._mean + self._log_std.exp() * noise)
+
+    def action_and_log_prob(self, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the action (N, A) of `noise` (N, A) and its log-probability (N,)."""
+        u = self._mean + self._log_std.exp() * noise
+        normal = -0.5 * (noise.square() + _LOG_2PI) - self._log_std
+        # log(1 - tanh(u)^2), in a form that does not underflow.
+        jacobian = 2.0 * (math.log(2.0) - u - nn.functional.softplus(-2.0 * u))
+        return torch.tanh(u), (normal - jacobian).sum(dim=-1)
+
+    def deterministic_output(self, mlp_output: torch.Tensor) -> torch.Tensor:
+        return torch.tanh(mlp_output[..., 0, :])
+
+    def as_deterministic_output_module(self) -> nn.Module:
+        return _TanhOfMean()
+
+    @property
+    def mean(self) -> torch.Tensor:
+        return torch.tanh(self._mean)
+
+    @property
+    def std(self) -> torch.Tensor:
+        return self._log_std.exp()
+
+    @property
+    def entropy(self) -> torch.Tensor:
+        return (0.5 * (_LOG_2PI + 1.0) + self._log_std).sum(dim=-1)
+
+    @property
+    def params(self) -> tuple[torch.Tensor, ...]:
+        return (self._mean, self.std)
+
+
+class _TanhOfMean(nn.Module):
+    def forward(self, mlp_output: torch.Tensor) -> torch.Tensor:
+        return torch.tanh(mlp_output[..., 0, :])
+
+
+def normalized_mlp(
+    input_dim: int, output_dim: int, hidden_dims: Sequence[int], activation: str
+) -> nn.Sequential:
+    """Return a perceptron whose hidden layers are normalized before their activation."""
+    layers: list[nn.Module] = []
+    for width in hidden_dims:
+        layers += [nn.Linear(input_dim, width), nn.LayerNorm(width)]
+        layers.append(resolve_nn_activation(activation))
+        input_dim = width
+    return nn.Sequential(*layers, nn.Linear(input_dim, output_dim))
+
+
+class SacActorModel(MLPModel):
+    """Policy network: rsl_rl's, with normalized layers."""
+
+    def __init__(self, *args: Any, hidden_dims: Sequence[int], activation: str, **kwargs: Any):
+        """Take the arguments of rsl_rl's `MLPModel`."""
+        super().__init__(*args, hidden_dims=tuple(hidden_dims), activation=activation, **kwargs)
+        assert self.distribution is not None
+        size = int(torch.Size(self.distribution.input_dim).numel())
+        mlp = normalized_mlp(self._get_latent_dim(), size, hidden_dims, activation)
+        mlp.append(nn.Unflatten(-1, tuple(self.distribution.input_dim)))
+        self.distribution.init_mlp_weights(mlp)
+        self.mlp = mlp
+
+
+class TwinCriticModel(MLPModel):
+    """Two critics that predict the distribution of the return of a state and an action.
+
+    The return is one of `num_atoms` values, evenly spaced over `value_range`.
+    """
+
+    def __init__(
+        self,
+        obs: TensorDict,
+        obs_groups: dict[str, list[str]],
+        obs_set: str,
+        num_actions: int,
+        *,
+        num_atoms: int,
+        value_range: tuple[float, float],
+        hidden_dims: Sequence[int],
+        activation: str,
+        obs_normalization: bool = False,
+    ) -> None:
+        """Take the observations as rsl_rl's `MLPModel` does.
+
+        Raises:
+            ValueError: the range of values is empty, or there are fewer than two atoms.
+        """
+        super().__init__(obs, obs_groups, obs_set, 1, (1,), activation, obs_normalization)
+        low, high = value_range
+        if not (low < high and num_atoms > 1):
+            raise ValueError(
+                f"SAC value_range, num_atoms: expected a lower and a higher value and 2 atoms or "
+                f"more, got {value_range} and {num_atoms}."
+            )
+        del self.mlp
+        input_dim = self._get_latent_dim() + num_actions
+        self.critics = nn.ModuleList(
+            normalized_mlp(input_dim, num_atoms, hidden_dims, activation) for _ in range(2)
+        )
+        self.register_buffer("atoms", torch.linspace(low, high, num_atoms), persistent=False)
+
+    def logits(self, latent: torch.Tensor, actions: torch.Tensor) -> list[torch.Tensor]:
+        """Return for each critic the logits (N, atoms), of `latent` observations (N, numbers)."""
+        inputs = torch.cat([latent, actions], dim=-1)
+        return [critic(inputs).float() for critic in self.critics]
+
+    def values(self, latent: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """Return the expected return (2, N) that each critic predicts."""
+        logits = torch.stack(self.logits(latent, actions))
+        return torch.softmax(logits, dim=-1) @ self.atoms
+
+    def distribution_of(self, returns: torch.Tensor, spread: float = 0.75) -> torch.Tensor:
+        """Return probabilities (N, atoms) whose mean is `returns` (N,), for cross-entropy.
+
+        A normal distribution around the return, of `spread` times the distance of the atoms, with
+        the mass between neighboring midpoints given to the atom between them (HL-Gauss,
+        Farebrother et al., arXiv 2403.03950). Returns beyond the range count as its ends.
+        """
+        atoms = self.atoms
+        distance = atoms[1] - atoms[0]
+        edges = torch.cat([atoms - 0.5 * distance, atoms[-1:] + 0.5 * distance])
+        returns = returns.clamp(atoms[0], atoms[-1])
+        scale = 1.0 / (math.sqrt(2.0) * spread * distance)
+        cumulative = torch.erf((edges - returns[:, None]) * scale)
+        mass = cumulative.diff(dim=-1)
+        return mass / mass.sum(dim=-1, keepdim=True)
