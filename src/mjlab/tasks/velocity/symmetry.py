@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 _ROBOT = "robot"
 _PLANAR_VELOCITY = (1.0, -1.0, -1.0)
+# Of (sin, cos): the other side steps then, for walks and trots.
+_HALF_A_CYCLE_LATER = (-1.0, -1.0)
 _OF_SENSOR = {
     mujoco.mjtSensor.mjSENS_GYRO: ROTATION,
     mujoco.mjtSensor.mjSENS_VELOCIMETER: DIRECTION,
@@ -277,12 +279,14 @@ def _same_instant(one: Any, other: Any) -> bool:
 
 def _of_command(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
     term = env.command_manager.get_term(params["command_name"])
-    if not isinstance(term, mdp.UniformVelocityCommand):
-        raise ValueError(
-            f"mirror_left_right knows velocity commands (UniformVelocityCommandCfg); "
-            f"{params['command_name']!r} is a {type(term).__name__}. {WITHOUT}"
-        )
-    return Mirror(range(3), _PLANAR_VELOCITY)
+    if isinstance(term, mdp.UniformVelocityCommand):
+        return Mirror(range(3), _PLANAR_VELOCITY)
+    if isinstance(term, mdp.GaitClockCommand):
+        return Mirror(range(2), _HALF_A_CYCLE_LATER)
+    raise ValueError(
+        "mirror_left_right knows velocity commands (UniformVelocityCommandCfg) and gait clocks "
+        f"(GaitClockCommandCfg); {params['command_name']!r} is a {type(term).__name__}. {WITHOUT}"
+    )
 
 
 def _of_joints(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:

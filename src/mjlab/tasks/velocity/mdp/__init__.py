@@ -6,6 +6,13 @@ from mjlab.envs.mdp import __all__ as _library
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.sensor import ContactSensor, RayCastSensor, TerrainHeightSensor
 from mjlab.tasks.velocity.mdp.curriculums import VelocityStage, commands_vel, terrain_levels_vel
+from mjlab.tasks.velocity.mdp.gait import (
+    GaitClockCommand,
+    GaitClockCommandCfg,
+    feet_height_by_phase,
+    feet_tilt,
+    weighted_joint_deviation,
+)
 from mjlab.tasks.velocity.mdp.observations import (
     foot_air_time,
     foot_contact,
@@ -41,6 +48,8 @@ __all__ = [
     "CommandTerm",
     "CommandTermCfg",
     "ContactSensor",
+    "GaitClockCommand",
+    "GaitClockCommandCfg",
     "RayCastSensor",
     "TerrainHeightSensor",
     "UniformVelocityCommand",
@@ -51,8 +60,10 @@ __all__ = [
     "commands_vel",
     "feet_air_time",
     "feet_clearance",
+    "feet_height_by_phase",
     "feet_slip",
     "feet_swing_height",
+    "feet_tilt",
     "foot_air_time",
     "foot_contact",
     "foot_contact_forces",
@@ -68,6 +79,7 @@ __all__ = [
     "track_linear_velocity",
     "upright",
     "variable_posture",
+    "weighted_joint_deviation",
     *(name for name in _library if name != "RayCastSensor"),
     *older_exports(__name__),
 ]

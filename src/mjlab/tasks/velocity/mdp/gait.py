@@ -1,0 +1,284 @@
+"""Gait clock: a command that tells when each foot swings, and reward terms for gaits.
+
+A policy that knows the time learns to step sooner than one that has to find a rhythm. The clock is a
+command, so that observations and rewards read one phase, and a checkpoint keeps it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import torch
+
+from mjlab.envs.mdp._checks import nearest, require_command, require_sensor
+from mjlab.envs.mdp._indexing import columns
+from mjlab.managers.build_checks import checked_when_built
+from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
+from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.sensor import TerrainHeightSensor
+from mjlab.tasks.velocity.mdp._shared import command_speed
+from mjlab.tasks.velocity.mdp.sensor_checks import check_height_sensor
+from mjlab.utils.lab_api.math import quat_apply_inverse
+from mjlab.utils.lab_api.string import resolve_matching_names_values
+from mjlab.utils.torch import constant_tensor
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.managers.reward_manager import RewardTermCfg
+
+_DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
+# Longer than any episode: the phase goes on until the next reset.
+_ONLY_AT_RESETS = (1e9, 1e9)
+
+
+@dataclass(kw_only=True)
+class GaitClockCommandCfg(CommandTermCfg):
+    """Gait clock configuration. Observe it with `generated_commands`."""
+
+    resampling_time_range: tuple[float, float] = _ONLY_AT_RESETS
+    """Shortest and longest time until the phase is redrawn (s); every reset draws one."""
+    frequency: float = 1.5
+    """Strides per second (Hz)."""
+    velocity_command_name: str | None = "twist"
+    """Velocity command that asks to stand. None: the clock always runs."""
+    standing_threshold: float = 0.1
+    """Commanded motion `|c_xy| + |c_z|` below which the clock stands."""
+
+    def build(self, env: ManagerBasedRlEnv) -> GaitClockCommand:
+        """Return the term.
+
+        Raises:
+            ValueError: frequency is not positive, or the velocity command does not exist.
+        """
+        return GaitClockCommand(self, env)
+
+
+class GaitClockCommand(CommandTerm):
+    """Clock of a periodic gait with frequency f, (sin phi, cos phi), where
+
+        phi = 2 pi (f t + o)
+
+    with t the time since the reset (s), and o in [0, 1) drawn at each reset. Where the velocity
+    command asks to stand, the command is (0, 0), and the phase goes on unseen.
+
+    Attributes:
+        cycles: (N,) phase in strides, `f t + o` modulo 1.
+    """
+
+    cfg: GaitClockCommandCfg
+
+    def __init__(self, cfg: GaitClockCommandCfg, env: ManagerBasedRlEnv) -> None:
+        super().__init__(cfg, env)
+        if not cfg.frequency > 0.0:
+            raise ValueError(f"frequency: expected a positive number (Hz), got {cfg.frequency!r}.")
+        # The manager of commands is still being built, so the config says which there are.
+        name, names = cfg.velocity_command_name, list(env.cfg.commands)
+        if name is not None and env.cfg.commands.get(name) is None:
+            raise ValueError(
+                f"velocity_command_name: unknown command {name!r}; {nearest(name, names)} Use None "
+                "for a clock that always runs."
+            )
+        self.cycles = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
+
+    @property
+    def command(self) -> torch.Tensor:
+        """The clock (sin phi, cos phi), (N, 2); zero where it stands."""
+        phase = self.phase
+        clock = torch.stack((torch.sin(phase), torch.cos(phase)), dim=1)
+        if self.cfg.velocity_command_name is None:
+            return clock
+        return clock.masked_fill_(self.is_standing.unsqueeze(1), 0.0)
+
+    @property
+    def phase(self) -> torch.Tensor:
+        """The phase phi, (N,), in [0, 2 pi)."""
+        return self.cycles * (2.0 * math.pi)
+
+    @property
+    def is_standing(self) -> torch.Tensor:
+        """True where the velocity command asks to stand, (N,)."""
+        # Read when asked for, so that the order of the commands does not matter.
+        if self.cfg.velocity_command_name is None:
+            return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        return command_speed(self._env, self.cfg.velocity_command_name) < (
+            self.cfg.standing_threshold
+        )
+
+    def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
+        """Advance the phase by `dt` seconds; the arguments are those of `CommandTerm.compute`."""
+        index = slice(None) if env_ids is None else env_ids
+        self.cycles[index] = torch.remainder(self.cycles[index] + self.cfg.frequency * dt, 1.0)
+        super().compute(dt, env_ids)
+
+    def _resample_command(self, env_ids: torch.Tensor) -> None:
+        self.cycles[env_ids] = torch.rand(len(env_ids), dtype=torch.float32, device=self.device)
+
+
+def _check_height_by_phase(
+    env: ManagerBasedRlEnv,
+    height_sensor_name: str,
+    command_name: str = "gait",
+    variance: float = 0.005,
+    offsets: tuple[float, ...] = (0.0, 0.5),
+    **_: Any,
+) -> None:
+    require_command(env, command_name)
+    term = env.command_manager.get_term(command_name)
+    if not isinstance(term, GaitClockCommand):
+        raise ValueError(
+            f"command_name: expected a GaitClockCommand, got {command_name!r}, a "
+            f"{type(term).__name__}; use the name of a GaitClockCommandCfg."
+        )
+    check_height_sensor(env, height_sensor_name)
+    frame = require_sensor(env, height_sensor_name, TerrainHeightSensor).cfg.frame
+    feet = [ref.name for ref in (frame if isinstance(frame, tuple) else (frame,))]
+    if len(offsets) != len(feet):
+        raise ValueError(
+            f"offsets: expected one number for each foot of {height_sensor_name!r}, {feet}, got "
+            f"{offsets}; use (0, 0.5) for two feet, and (0, 0.5, 0.5, 0) for the trot of four."
+        )
+    if not variance > 0.0:
+        raise ValueError(f"variance: expected a positive number (m^2), got {variance!r}.")
+
+
+@checked_when_built(_check_height_by_phase)
+def feet_height_by_phase(
+    env: ManagerBasedRlEnv,
+    height_sensor_name: str,
+    command_name: str = "gait",
+    swing_height: float = 0.09,
+    variance: float = 0.005,
+    offsets: tuple[float, ...] = (0.0, 0.5),
+    rest_height: float = 0.0,
+) -> torch.Tensor:
+    """Reward feet that swing as high as the gait clock says, and stand while it says so:
+
+        exp(-sum_i (h_i - h*_i)^2 / variance),    h*_i = swing_height max(0, sin(phi + 2 pi o_i))^2
+
+    with h_i the height of foot i above `rest_height`. Feet swing in one half of the cycle and stand
+    in the other; while the clock stands, all do. Heights and phase are those that the policy saw.
+
+    Args:
+        env: The environment.
+        height_sensor_name: Height sensor with one frame for each foot.
+        command_name: The gait clock.
+        swing_height: Height of the middle of a swing (m).
+        variance: Sum of squared errors at which the reward is 1/e (m^2).
+        offsets: Offset o_i of each foot (fractions of a cycle), in the order of the sensor's
+            frames. For a trot of four, diagonal feet have the same.
+        rest_height: Reading of the sensor for a foot that stands (m): 0 for the G1, whose sites are
+            in the soles, and 0.0225 for the Go1, whose sites are in the middle of the feet.
+    """
+    clock: Any = env.command_manager.get_term(command_name)
+    cycles = clock.cycles.unsqueeze(1) + constant_tensor(tuple(offsets), env.device)
+    swing = torch.sin(cycles * (2.0 * math.pi)).clamp_(min=0.0).square_()
+    target = swing.masked_fill_(clock.is_standing.unsqueeze(1), 0.0).mul_(swing_height)
+    error = env.scene[height_sensor_name].data.heights - rest_height - target
+    return torch.exp(error.square().sum(dim=1) / -variance)
+
+
+class weighted_joint_deviation:
+    """Squared distance of joints from the default positions q0: `sum_j w_j (q_j - q0_j)^2`.
+
+    Params:
+        weights: Dict of joint name pattern to weight w, at least 0. Read once; every selected joint
+            must match one pattern, and every pattern a joint.
+        asset_cfg: Entity and joints; all joints where none are selected.
+
+    Raises, when built: `ValueError` for weights that do not fit the joints, or are negative.
+    """
+
+    # Follows from the config, so it is no run-time state.
+    _transient = {"_weights"}
+
+    def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
+        weights: dict[str, float] = cfg.params["weights"]
+        asset_cfg: SceneEntityCfg = cfg.params.get("asset_cfg", _DEFAULT_ASSET_CFG)
+        asset: Entity = env.scene[asset_cfg.name]
+        # The names are in the order of the joint ids, whichever order the config asks for.
+        joints = list(asset_cfg.joint_names or asset.joint_names)
+        try:
+            _, covered, values = resolve_matching_names_values(weights, joints)
+        except ValueError as error:
+            raise ValueError(f"weights: {error}") from error
+        missing = [joint for joint in joints if joint not in covered]
+        if missing:
+            raise ValueError(
+                f"weights: expected a pattern for every selected joint, got none for {missing}; use "
+                "weight 0 for joints that are free."
+            )
+        wrong = {pattern: weight for pattern, weight in weights.items() if not weight >= 0.0}
+        if wrong:
+            raise ValueError(f"weights: expected numbers of at least 0, got {wrong}.")
+        self._weights = torch.tensor(values, dtype=torch.float32, device=env.device)
+
+    def __call__(
+        self,
+        env: ManagerBasedRlEnv,
+        weights: object,
+        asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+    ) -> torch.Tensor:
+        """Return the cost, (N,)."""
+        asset: Entity = env.scene[asset_cfg.name]
+        joints = columns(asset_cfg.joint_ids, env.device)
+        error = asset.data.joint_pos[:, joints] - asset.data.default_joint_pos[:, joints]
+        return (error.square_() * self._weights).sum(dim=1)
+
+
+class feet_tilt:
+    """Tilt of feet from how they stand in the default pose: `sum_i sin(angle_i)^2`.
+
+    The angle of foot i is that between "up" and the direction fixed to the foot that points up in
+    the default pose with an upright root. For a level sole, the sum is that of the squared x and y
+    components of gravity's direction in the foot's frame.
+
+    Params:
+        asset_cfg: Entity, and the feet as `site_names` or `body_names`.
+
+    Raises, when built: `ValueError` unless either sites or bodies are selected.
+    """
+
+    # Follows from the model, so it is no run-time state.
+    _transient = {"_up", "_rest"}
+
+    def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
+        asset_cfg: SceneEntityCfg = cfg.params["asset_cfg"]
+        if bool(asset_cfg.site_names) == bool(asset_cfg.body_names):
+            raise ValueError(
+                "asset_cfg: expected site_names or body_names, got site_names="
+                f"{asset_cfg.site_names} and body_names={asset_cfg.body_names}; name the feet."
+            )
+        self._up = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float32, device=env.device)
+        self._rest = _up_at_rest(env, asset_cfg).to(env.device)
+
+    def __call__(self, env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
+        """Return the cost, (N,)."""
+        data = env.scene[asset_cfg.name].data
+        if asset_cfg.site_names:
+            quat = data.site_quat_w[:, columns(asset_cfg.site_ids, env.device)]
+        else:
+            quat = data.body_link_quat_w[:, columns(asset_cfg.body_ids, env.device)]
+        up = quat_apply_inverse(quat, self._up.expand(*quat.shape[:-1], 3))
+        # The length of a cross product, because 1 - cos^2 of a small angle is rounded away.
+        return torch.linalg.cross(up, self._rest.expand_as(up)).square_().sum(dim=(1, 2))
+
+
+def _up_at_rest(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
+    """Return "up" in the frame of each foot, (feet, 3), in the default pose with an upright root."""
+    model = env.sim.mj_model
+    data = mujoco.MjData(model)
+    asset: Entity = env.scene[asset_cfg.name]
+    pose = asset.data.default_joint_pos[0].tolist()
+    for joint, position in zip(asset.indexing.joint_ids.tolist(), pose, strict=True):
+        data.qpos[model.jnt_qposadr[joint]] = position
+    mujoco.mj_kinematics(model, data)
+    if asset_cfg.site_names:
+        matrices = data.site_xmat[asset.indexing.site_ids[asset_cfg.site_ids].cpu()]
+    else:
+        matrices = data.xmat[asset.indexing.body_ids[asset_cfg.body_ids].cpu()]
+    # The third row of a rotation matrix is world z in the rotated frame.
+    return torch.tensor(matrices[:, 6:], dtype=torch.float32)
