@@ -87,6 +87,14 @@ class RewardManager(TermFunctionSwitches, TermListManager):
             self._reward_buf.add_(row, alpha=scale)
         return self._reward_buf
 
+    def episode_sum(self, term_name: str) -> torch.Tensor:
+        """Return what a term has added to the reward of each running episode, (num_envs,).
+
+        Raises `ValueError`, with the valid names, if there is no such term.
+        """
+        self.get_term_cfg(term_name)
+        return self._episode_sums[self._term_names.index(term_name)]
+
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, torch.Tensor]:
         """Return `Episode_Reward/<term>`, and zero the sums of these environments.
 

@@ -1,11 +1,13 @@
 """What makes a task easier while its learning begins, for `cpu` profiles, and what undoes it.
 
-Weights, pushes and starts are eased by curriculum terms, which change what is in use and no config. So
-what a flag says of them is where they end, and without those terms the task is as it was.
+Weights, pushes, commands, noise and starts are eased by curriculum terms, which change what is in use
+and no config. So what a flag says of them is where they end, and without those terms the task is as it
+was.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -14,6 +16,13 @@ import torch
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.managers.curriculum_manager import CurriculumTermCfg
 from mjlab.managers.manager_base import ManagerTermBase
+from mjlab.utils.noise import (
+    ConstantNoiseCfg,
+    GaussianNoiseCfg,
+    NoiseCfg,
+    NoiseModelCfg,
+    UniformNoiseCfg,
+)
 
 Undo = Callable[[ManagerBasedRlEnvCfg], None]
 """Gives a config, or a copy of it, back what was changed."""
@@ -22,6 +31,12 @@ Ranges = dict[str, tuple[float, float]]
 
 _PUSH = "push_robot"
 _NUM_STAGES = 60
+_COMMAND_RANGES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
+_NOISE_SIZES: dict[type[NoiseCfg], tuple[str, ...]] = {
+    ConstantNoiseCfg: ("bias",),
+    GaussianNoiseCfg: ("mean", "std"),
+    UniformNoiseCfg: ("n_min", "n_max"),
+}
 
 
 def ease_weight(env_cfg: ManagerBasedRlEnvCfg, name: str, first: float, steps: int) -> None:
@@ -35,6 +50,21 @@ def ease_pushes(env_cfg: ManagerBasedRlEnvCfg, steps: int) -> None:
     if env_cfg.events.get(_PUSH) is not None:
         params = {"event_name": _PUSH, "steps": steps}
         env_cfg.curriculum[f"eased_{_PUSH}"] = CurriculumTermCfg(func=GrowingPushes, params=params)
+
+
+def grow_difficulty(
+    env_cfg: ManagerBasedRlEnvCfg, reward_name: str, tracking: float, **params: Any
+) -> None:
+    """Let commands, pushes and observation noise grow to what they are, while a policy copes.
+
+    Args:
+        env_cfg: Config to edit.
+        reward_name: Reward term that tells how well commands are followed.
+        tracking: Fraction of its largest value that it must exceed.
+        **params: Further parameters of `GrowingDifficulty`.
+    """
+    params = {"reward_name": reward_name, "tracking": tracking, **params}
+    env_cfg.curriculum["difficulty"] = CurriculumTermCfg(func=GrowingDifficulty, params=params)
 
 
 def drop_easing(env_cfg: ManagerBasedRlEnvCfg) -> None:
@@ -80,7 +110,7 @@ def undo_all(undos: Sequence[Undo]) -> Undo:
 
 
 class Easing(ManagerTermBase):
-    """Base of curriculum terms that ease something until so many environment steps are made."""
+    """Base of curriculum terms that ease something at first, such as for so many environment steps."""
 
     def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(env)
@@ -148,3 +178,164 @@ class GrowingPushes(Easing):
 
     def _params(self, event_name: str) -> dict[str, Any]:
         return self._env.event_manager.get_term_cfg(event_name).params
+
+
+class GrowingDifficulty(Easing):
+    """Lets one difficulty d grow from 0 to 1, by `step`, after each interval in which a policy copes.
+
+    It copes if, among the episodes that ended in the interval, the fraction that survived exceeds
+    `survival`, and the mean of the reward term, as a fraction of its weight and over all their steps,
+    exceeds `tracking`. An episode survives that lasts `survival_s`, or as long as the task lets it, and
+    one falls that is terminated before. Episodes that a time-out cuts shorter, as training does that
+    starts at random points of episodes, are neither. Steps are those really made since the reset.
+
+    With d, these fractions of what was built are in use; what the task does not have is left alone:
+
+        command ranges    command_from + (1 - command_from) d
+        pushes            push_from + (1 - push_from) d
+        noise             noise_from + (1 - noise_from) d
+
+    Ranges that another curriculum term sets meanwhile become those to grow to.
+
+    Params:
+        reward_name: Reward term of positive weight, at most 1 without it.
+        tracking: Least fraction of that.
+        survival: Least fraction of episodes.
+        survival_s: Time to survive (s).
+        step: Growth of d.
+        interval: Length of an interval (environment steps).
+        command_name: Velocity command whose ranges lin_vel_x, lin_vel_y and ang_vel_z grow.
+        command_from: Their fraction at d = 0.
+        event_name: Event with a `velocity_range`.
+        push_from: Its fraction at d = 0.
+        noise_group: Observation group whose noise grows.
+        noise_from: Its fraction at d = 0.
+
+    Returns d.
+
+    Raises, when built: `ValueError` for a reward term that does not exist or has no positive weight, or
+    noise whose size is not known.
+    """
+
+    # Settings from the config.
+    _transient = {"_pushes", "_noises"}
+
+    def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
+        super().__init__(cfg, env)
+        name = cfg.params["reward_name"]
+        weight = env.reward_manager.get_term_cfg(name).weight
+        if not weight > 0.0:
+            raise ValueError(
+                f"reward_name: expected a term of positive weight, got {name!r} of {weight}."
+            )
+        self.difficulty = 0.0
+        self.last_survival, self.last_tracking = 0.0, 0.0
+        self._interval_start = 0
+        self._episode_start = torch.zeros(env.num_envs, dtype=torch.long, device=env.device)
+        # Of the interval: episodes that survived, that fell, their reward, and their steps.
+        self._tally = torch.zeros(4, dtype=torch.float64, device=env.device)
+        self._command_part = 1.0
+        self._ranges = self._ranges_in_use(cfg.params.get("command_name", "twist"))
+        event_name = cfg.params.get("event_name", _PUSH)
+        self._pushes: Ranges | None = None
+        if env.cfg.events.get(event_name) is not None:
+            event = env.event_manager.get_term_cfg(event_name)
+            self._pushes = dict(event.params["velocity_range"])
+        self._noises = self._noises_of(cfg.params.get("noise_group", "actor"))
+
+    def __call__(
+        self,
+        env: ManagerBasedRlEnv,
+        env_ids: torch.Tensor | slice,
+        reward_name: str,
+        tracking: float,
+        survival: float = 0.6,
+        survival_s: float = 10.0,
+        step: float = 0.05,
+        interval: int = 1500,
+        command_name: str = "twist",
+        command_from: float = 0.5,
+        event_name: str = _PUSH,
+        push_from: float = 0.0,
+        noise_group: str = "actor",
+        noise_from: float = 0.2,
+    ) -> float:
+        self._count(env_ids, reward_name, survival_s)
+        if env.common_step_counter - self._interval_start >= interval:
+            if self._copes(reward_name, survival, tracking):
+                self.difficulty = min(self.difficulty + step, 1.0)
+            self._interval_start = env.common_step_counter
+        d = self.difficulty
+        self._scale_command(command_name, command_from + (1.0 - command_from) * d)
+        if self._pushes is not None:
+            part = push_from + (1.0 - push_from) * d
+            grown = {axis: (part * low, part * high) for axis, (low, high) in self._pushes.items()}
+            env.event_manager.get_term_cfg(event_name).params["velocity_range"] = grown
+        part = noise_from + (1.0 - noise_from) * d
+        for noise, sizes in self._noises:
+            for name, size in sizes.items():
+                setattr(noise, name, _times(size, part))
+        return d
+
+    def _count(self, env_ids: torch.Tensor | slice, reward_name: str, survival_s: float) -> None:
+        """Count the episodes that end. An evaluation in between makes no steps, and counts none."""
+        env = self._env
+        steps = env.common_step_counter - self._episode_start[env_ids]
+        enough = math.ceil(min(survival_s, env.max_episode_length_s) / env.step_dt - 1e-6)
+        survived = steps >= enough
+        fell = env.termination_manager.terminated[env_ids] & (steps > 0) & ~survived
+        reward = env.reward_manager.episode_sum(reward_name)[env_ids]
+        self._tally += torch.stack(
+            [part.sum().double() for part in (survived, fell, reward, steps)]
+        )
+        self._episode_start[env_ids] = env.common_step_counter
+
+    def _copes(self, reward_name: str, survival: float, tracking: float) -> bool:
+        """Return whether the policy coped in the interval, and start to count anew."""
+        env = self._env
+        survived, fell, reward, steps = self._tally.tolist()
+        self._tally.zero_()
+        unit = env.step_dt if env.cfg.scale_rewards_by_dt else 1.0
+        weight = env.reward_manager.get_term_cfg(reward_name).weight
+        self.last_survival = survived / max(survived + fell, 1.0)
+        self.last_tracking = reward / (max(steps, 1.0) * unit * weight) if weight > 0.0 else 0.0
+        return self.last_survival > survival and self.last_tracking > tracking
+
+    def _ranges_in_use(self, command_name: str) -> Ranges:
+        if self._env.cfg.commands.get(command_name) is None:
+            return {}
+        cfg: Any = self._env.command_manager.get_term_cfg(command_name)
+        return {name: tuple(getattr(cfg.ranges, name)) for name in _COMMAND_RANGES}
+
+    def _scale_command(self, command_name: str, part: float) -> None:
+        for name, bounds in self._ranges_in_use(command_name).items():
+            if bounds != _times(self._ranges[name], self._command_part):
+                self._ranges[name] = bounds
+            cfg: Any = self._env.command_manager.get_term_cfg(command_name)
+            setattr(cfg.ranges, name, _times(self._ranges[name], part))
+        self._command_part = part
+
+    def _noises_of(self, group: str) -> list[tuple[NoiseCfg, dict[str, Any]]]:
+        """Return the live noise configs of a group, each with its sizes as built."""
+        manager = self._env.observation_manager
+        noises = []
+        for name in manager.active_terms.get(group, ()):
+            noise = manager.get_term_cfg(group, name).noise
+            parts: list[Any] = [noise]
+            if isinstance(noise, NoiseModelCfg):
+                parts = [noise.noise_cfg, getattr(noise, "bias_noise_cfg", None)]
+            for part in parts:
+                if part is None:
+                    continue
+                if type(part) not in _NOISE_SIZES or part.operation == "scale":
+                    raise ValueError(
+                        f"noise of {group}/{name}: expected constant, Gaussian or uniform noise that "
+                        f"is added, got {part!r}; use another noise_group to leave it as it is."
+                    )
+                noises.append((part, {f: getattr(part, f) for f in _NOISE_SIZES[type(part)]}))
+        return noises
+
+
+def _times(size: Any, factor: float) -> Any:
+    """Return a number, or each of a tuple, times `factor`."""
+    return tuple(factor * s for s in size) if isinstance(size, tuple) else factor * size
