@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import logging
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 
+from mjlab.rl.checkpoint import load_checkpoint, save_checkpoint
 from mjlab.rl.rsl import TensorDict
+
+logger = logging.getLogger(__name__)
 
 # How an environment step ended, from the learner's view.
 _GOES_ON, _TERMINATED, _TIMED_OUT, _CUT_OFF = range(4)
@@ -79,8 +85,7 @@ class ReplayStorage:
         self._num_ends_stored = 0
         self._row = 0
         self._num_filled = 0
-        for name in groups:
-            self._observations[name][0] = observations[name]
+        self._put(observations)
 
     @property
     def num_filled(self) -> int:
@@ -93,9 +98,18 @@ class ReplayStorage:
         return sum(tensor.nbytes for tensor in self._tensors().values())
 
     def start(self, observations: TensorDict) -> None:
-        """Take the observations that the next step starts from, where no step led to them."""
-        for name, stored in self._observations.items():
-            stored[self._row] = observations[name]
+        """Take the observations that the next step starts from, where `add` has not had them.
+
+        Where they are others than those that the last step led to, what that step led to is not
+        known.
+        """
+        if self._num_filled > 0:
+            elsewhere = torch.zeros(self._num_envs, dtype=torch.bool, device=self._device)
+            for name, stored in self._observations.items():
+                elsewhere |= (stored[self._row] != observations[name]).flatten(1).any(dim=1)
+            last = self._kinds[self._row - 1]
+            last[elsewhere & (last == _GOES_ON)] = _CUT_OFF
+        self._put(observations)
 
     def add(
         self,
@@ -135,7 +149,7 @@ class ReplayStorage:
             self._num_ends_stored += count
         self._row = (row + 1) % (self._num_steps + 1)
         self._num_filled = min(self._num_filled + 1, self._num_steps)
-        self.start(next_observations)
+        self._put(next_observations)
 
     def sample(
         self, size: int, gamma: float, num_steps: int, generator: torch.Generator | None = None
@@ -213,6 +227,10 @@ class ReplayStorage:
         self._num_filled = state["num_filled"]
         self._num_ends_stored = state["num_ends_stored"]
 
+    def _put(self, observations: TensorDict) -> None:
+        for name, stored in self._observations.items():
+            stored[self._row] = observations[name]
+
     def _tensors(self) -> dict[str, torch.Tensor]:
         return {
             "actions": self._actions,
@@ -225,3 +243,48 @@ class ReplayStorage:
 
     def _as_tensordict(self, groups: dict[str, torch.Tensor], size: int) -> TensorDict:
         return TensorDict(groups, batch_size=[size])
+
+
+class ReplayFiles:
+    """The replay beside a checkpoint: `replay_model_100.pt` beside `model_100.pt`.
+
+    In a file of its own, because it is a thousand times as large as the networks; only the newest
+    checkpoint of a folder has one.
+    """
+
+    def __init__(self, checkpoint: str | os.PathLike[str]) -> None:
+        """Take the path of the checkpoint."""
+        path = Path(checkpoint)
+        self.path = path.with_name(f"replay_{path.name}")
+        """The file."""
+
+    def write(self, storage: ReplayStorage) -> None:
+        """Write the contents of `storage`.
+
+        Raises:
+            CheckpointError: it could not be written.
+        """
+        save_checkpoint(storage.state_dict(), self.path)
+
+    def read(self, storage: ReplayStorage) -> None:
+        """Fill `storage`; warn where there is no file, or one of other environments.
+
+        Raises:
+            CheckpointError: the file is damaged.
+        """
+        if not self.path.exists():
+            logger.warning(
+                "The replay starts empty: %s is not there. Learning goes on from new steps only.",
+                self.path,
+            )
+            return
+        try:
+            storage.load_state_dict(load_checkpoint(self.path))
+        except (KeyError, ValueError) as error:
+            logger.warning("The replay starts empty, because the saved one does not fit. %s", error)
+
+    def remove_others(self) -> None:
+        """Delete the replays of the folder's other checkpoints."""
+        for other in self.path.parent.glob("replay_model_*.pt"):
+            if other != self.path:
+                other.unlink(missing_ok=True)

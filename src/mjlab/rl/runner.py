@@ -34,6 +34,7 @@ from mjlab.rl.image_encoders import (
 from mjlab.rl.migration import check_fits, check_optimizer_fits, migrate
 from mjlab.rl.network_checks import check_networks
 from mjlab.rl.onnx_export import export_to_onnx
+from mjlab.rl.replay import ReplayFiles, ReplayStorage
 from mjlab.rl.progress import IterationStats, TrainingObserver
 from mjlab.rl.rsl import (
     OnPolicyRunner,
@@ -342,7 +343,13 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         checkpoint["training_state"] = training_state.capture(
             self.env, self.alg, self.logger, observations
         )
+        replays = ReplayFiles(path) if self._saves_replay else None
+        if replays is not None:
+            # First, so that the newest checkpoint always has one, whenever writing is interrupted.
+            replays.write(self.alg.storage)
         save_checkpoint(checkpoint, path)
+        if replays is not None:
+            replays.remove_others()
         if self.cfg.get("upload_model", True):
             self.logger.save_model(path, max(done - 1, 0))
 
@@ -382,6 +389,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if counter is not None:
             self.env.unwrapped.common_step_counter = counter
         self._state_to_resume = checkpoint.get("training_state") if load_cfg is None else None
+        if load_cfg is None and isinstance(self.alg.storage, ReplayStorage):
+            ReplayFiles(path).read(self.alg.storage)
         self._observations = None
         return infos
 
@@ -538,6 +547,12 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     def _writes(self) -> bool:
         """Whether this process writes files: the first one does."""
         return self.gpu_global_rank == 0
+
+    @property
+    def _saves_replay(self) -> bool:
+        return bool(self.cfg["algorithm"].get("save_replay")) and isinstance(
+            self.alg.storage, ReplayStorage
+        )
 
     @property
     def _uses_rnd(self) -> bool:

@@ -1,0 +1,217 @@
+"""Soft actor-critic: it learns, and the same seed gives the same weights, resumed or not."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from rl_fake_env import FakeEnv, FakeEnvCfg, FakeSceneCfg
+from torch.distributions import Normal, TransformedDistribution
+from torch.distributions.transforms import TanhTransform
+
+from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
+from mjlab.rl.config import RslRlOffPolicyRunnerCfg, RslRlSacAlgorithmCfg
+from mjlab.rl.onnx_policy import load_onnx_policy
+from mjlab.rl.rsl import TensorDict
+from mjlab.rl.sac_models import SquashedGaussian, TwinCriticModel
+
+
+def mirror(env: Any, obs: Any = None, actions: Any = None) -> tuple[Any, Any]:
+    """The fake environment is the same upside down."""
+    if obs is not None:
+        obs = torch.cat([obs, TensorDict({k: -v for k, v in obs.items()}, obs.batch_size)])
+    if actions is not None:
+        actions = torch.cat([actions, -actions])
+    return obs, actions
+
+
+MIRROR = {"data_augmentation_func": "test_sac:mirror"}
+
+
+def make_runner(log_dir: Path | None = None, num_envs: int = 8, **changes: Any) -> Any:
+    algorithm = RslRlSacAlgorithmCfg(
+        batch_size=32, num_updates=2, replay_steps=20, learning_starts=3, policy_delay=2
+    )
+    algorithm = dataclasses.replace(algorithm, **changes)
+    cfg = RslRlOffPolicyRunnerCfg(num_steps_per_env=5, save_interval=2, algorithm=algorithm)
+    cfg.actor.hidden_dims = cfg.critic.hidden_dims = (16, 16)
+    env = RslRlVecEnvWrapper(FakeEnv(FakeEnvCfg(scene=FakeSceneCfg(num_envs=num_envs))))
+    return MjlabOnPolicyRunner(env, asdict(cfg), None if log_dir is None else str(log_dir))
+
+
+def everything(runner: Any) -> dict[str, torch.Tensor]:
+    """Return all that decides how training goes on, by name."""
+    found: dict[str, torch.Tensor] = {}
+
+    def collect(name: str, value: Any) -> None:
+        if isinstance(value, torch.Tensor):
+            found[name] = value.clone()
+        elif isinstance(value, dict):
+            for key, item in value.items():
+                collect(f"{name}/{key}", item)
+        elif isinstance(value, int | float):
+            found[name] = torch.tensor(value)
+
+    collect("algorithm", runner.alg.save())
+    collect("replay", runner.alg.storage.state_dict())
+    collect("env", runner.env.unwrapped.state_dict())
+    return found
+
+
+def assert_same_bits(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> None:
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        assert torch.equal(value, other[name]), name
+
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "all": {
+        "symmetry_cfg": MIRROR,
+        "noise_hold": 4,
+        "num_steps_return": 3,
+        "use_mixed_precision": True,
+        "pessimistic": True,
+    },
+    "fixed range": {"value_range": (-1.0, 5.0)},
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_same_seed_gives_the_same_weights(variant):
+    results = []
+    for _ in range(2):
+        torch.manual_seed(3)
+        runner = make_runner(**VARIANTS[variant])
+        runner.learn(6)
+        results.append(everything(runner))
+    assert_same_bits(*results)
+
+
+def test_to_learn_beside_the_physics_changes_no_bit():
+    results = []
+    for beside in (True, False):
+        torch.manual_seed(3)
+        runner = make_runner()
+        assert runner.alg._thread is not None
+        if not beside:
+            runner.alg._thread = None
+        runner.learn(5)
+        results.append(everything(runner))
+    assert_same_bits(*results)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_resumed_run_takes_the_same_course(tmp_path, variant):
+    torch.manual_seed(3)
+    whole = make_runner(**VARIANTS[variant])
+    whole.learn(7)
+
+    torch.manual_seed(3)
+    first = make_runner(tmp_path, **VARIANTS[variant])
+    first.learn(4)
+    torch.manual_seed(99)
+    second = make_runner(tmp_path, **VARIANTS[variant])
+    second.load(str(tmp_path / "model_3.pt"))
+    second.learn(7)
+    assert_same_bits(everything(whole), everything(second))
+
+
+def test_a_run_says_that_it_resumes_without_its_replay(tmp_path, caplog):
+    make_runner(tmp_path, save_replay=False).learn(2)
+    assert not list(tmp_path.glob("replay*"))
+    resumed = make_runner(tmp_path)
+    resumed.load(str(tmp_path / "model_1.pt"))
+    assert "replay starts empty" in caplog.text
+    resumed.learn(3)
+
+
+def test_what_goes_wrong_while_learning_ends_the_run():
+    runner = make_runner()
+
+    def fail(*_: Any) -> None:
+        raise FloatingPointError("not today")
+
+    runner.alg._update = fail
+    with pytest.raises(FloatingPointError, match="not today"):
+        runner.learn(3)
+
+
+def test_it_learns_to_stay_where_rewards_are():
+    torch.manual_seed(0)
+    runner = make_runner(
+        num_envs=32,
+        actor_learning_rate=3e-3,
+        critic_learning_rate=3e-3,
+        replay_steps=200,
+        gamma=0.9,
+        target_std=0.3,
+    )
+    before = runner.alg._policy
+    observations = TensorDict({"actor": torch.tensor([[0.8, 0.0], [0.0, -0.8]])}, batch_size=[2])
+    assert torch.equal(before(observations), torch.zeros(2, 2))
+    runner.learn(60)
+    actions = runner.get_inference_policy()(observations)
+    assert actions[0, 0] < -0.3
+    assert actions[1, 1] > 0.3
+
+
+def test_the_exported_policy_acts_as_the_policy(tmp_path):
+    runner = make_runner(tmp_path)
+    runner.learn(3)
+    path = runner.export_policy(str(tmp_path / "policy.onnx"))
+    policy = load_onnx_policy(Path(path), runner.env, "cpu")
+    observations = runner.env.get_observations()
+    wanted = runner.get_inference_policy()(observations)
+    torch.testing.assert_close(policy(observations), wanted, atol=1e-5, rtol=0.0)
+
+
+# The distributions.
+
+
+def test_squashed_log_probabilities_are_those_of_a_transformed_normal():
+    torch.manual_seed(0)
+    ours = SquashedGaussian(3, init_std=0.5)
+    ours.update(torch.randn(10, 2, 3))
+    noise = torch.randn(10, 3)
+    actions, log_prob = ours.action_and_log_prob(noise)
+    u = Normal(ours.params[0], ours.params[1])
+    theirs = TransformedDistribution(u, [TanhTransform(cache_size=1)])
+    torch.testing.assert_close(log_prob, theirs.log_prob(actions).sum(-1), atol=1e-3, rtol=1e-4)
+    torch.testing.assert_close(ours.entropy, u.entropy().sum(-1))
+
+
+def test_a_deviation_out_of_range_is_refused():
+    with pytest.raises(ValueError, match="init_std"):
+        SquashedGaussian(2, init_std=2.0)
+
+
+def critic(**changes: Any) -> TwinCriticModel:
+    kwargs = {"num_atoms": 101, "value_range": (-5.0, 15.0), "hidden_dims": (8,), **changes}
+    observations = TensorDict({"critic": torch.zeros(2, 4)}, batch_size=[2])
+    groups = {"critic": ["critic"]}
+    return TwinCriticModel(observations, groups, "critic", 3, activation="relu", **kwargs)
+
+
+def test_distributions_of_returns_have_them_as_mean():
+    model = critic()
+    returns = torch.linspace(-4.5, 14.5, 57)
+    probabilities = model.distribution_of(returns)
+    torch.testing.assert_close(probabilities.sum(-1), torch.ones(57))
+    torch.testing.assert_close(probabilities @ model.atoms, returns, atol=1e-3, rtol=0.0)
+
+
+def test_returns_beyond_the_range_count_as_its_ends():
+    model = critic()
+    far, end = (model.distribution_of(torch.tensor([value])) for value in (99.0, 15.0))
+    assert torch.equal(far, end)
+
+
+@pytest.mark.parametrize("changes", [{"num_atoms": 1}, {"value_range": (1.0, 1.0)}])
+def test_critics_that_tell_nothing_apart_are_refused(changes):
+    with pytest.raises(ValueError, match="value_range, num_atoms"):
+        critic(**changes)
