@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import copy
+import math
 
 import pytest
+import torch
 from built_envs import built_envs
 
 from mjlab.envs import ManagerBasedRlEnv
-from mjlab.tasks.easing import Easing, coarsen_physics, drop_easing
+from mjlab.tasks.easing import (
+    Easing,
+    GrowingDifficulty,
+    coarsen_physics,
+    drop_easing,
+    grow_difficulty,
+)
 from mjlab.tasks.registry import load_env_cfg
 
 GO1 = "Mjlab-Velocity-Flat-Unitree-Go1"
@@ -149,3 +157,152 @@ def test_an_odd_number_of_physics_steps_has_no_half():
     cfg.decimation = 5
     with pytest.raises(ValueError, match="half of 5 steps"):
         coarsen_physics(cfg)
+
+
+# Difficulty.
+
+
+@pytest.fixture
+def make_growing():
+    """Build two environments whose difficulty grows; arguments are those of `GrowingDifficulty`."""
+
+    def cfg(**params):
+        cfg = load_env_cfg(GO1)
+        cfg.scene.num_envs, cfg.seed, cfg.sim.engine = 2, 1, "native"
+        cfg.curriculum = {}
+        params = {"reward_name": "track_linear_velocity", "tracking": 0.5, **params}
+        grow_difficulty(cfg, **{"survival_s": 1.0, "step": 0.25, "interval": 100, **params})
+        return cfg
+
+    for make in built_envs(cfg):
+
+        def reset(*args, make=make, **kwargs):
+            env = make(*args, **kwargs)
+            env.reset()
+            return env
+
+        yield reset
+
+
+def end_episodes(env: ManagerBasedRlEnv, steps: int, falls: bool, tracking: float) -> float:
+    """End an episode in each environment after so many steps; return the difficulty."""
+    env.common_step_counter += steps
+    env.termination_manager.terminated.fill_(falls)
+    weight = env.reward_manager.get_term_cfg("track_linear_velocity").weight
+    sums = env.reward_manager.episode_sum("track_linear_velocity")
+    sums.fill_(tracking * weight * steps * env.step_dt)
+    env.reset()
+    return difficulty(env).difficulty
+
+
+def difficulty(env: ManagerBasedRlEnv) -> GrowingDifficulty:
+    return env.curriculum_manager.get_term_cfg("difficulty").func
+
+
+@pytest.mark.parametrize(
+    ("steps", "falls", "tracking", "expected"),
+    [
+        (120, False, 0.9, 0.25),
+        # An episode that falls late enough has survived.
+        (120, True, 0.9, 0.25),
+        (40, True, 0.9, 0.0),
+        (120, False, 0.4, 0.0),
+        (40, True, 0.4, 0.0),
+        # Cut off before it could survive: neither survived nor fell.
+        (40, False, 0.9, 0.0),
+    ],
+)
+def test_difficulty_grows_only_with_survival_and_tracking(
+    make_growing, steps, falls, tracking, expected
+):
+    env = make_growing()
+    grown = 0.0
+    for _ in range(math.ceil(100 / steps)):
+        grown = end_episodes(env, steps, falls, tracking)
+    assert grown == expected
+
+
+def test_difficulty_grows_once_in_an_interval_and_up_to_one(make_growing):
+    env = make_growing()
+    assert [end_episodes(env, 60, False, 0.9) for _ in range(4)] == [0.0, 0.25, 0.25, 0.5]
+    for _ in range(10):
+        end_episodes(env, 100, False, 0.9)
+    assert difficulty(env).difficulty == 1.0
+
+
+def test_a_random_start_within_an_episode_is_no_survival(make_growing):
+    env = make_growing()
+    env.episode_length_buf[:] = env.max_episode_length - 1
+    env.step(torch.zeros(2, env.action_manager.total_action_dim))
+    assert env.episode_length_buf.tolist() == [0, 0]
+    assert difficulty(env)._tally.tolist()[:2] == [0.0, 0.0]
+    assert difficulty(env)._tally.tolist()[3] == 2.0
+
+
+def in_use(env: ManagerBasedRlEnv) -> tuple:
+    ranges = env.command_manager.get_term_cfg("twist").ranges
+    pushes = env.event_manager.get_term_cfg("push_robot").params["velocity_range"]
+    noise = env.observation_manager.get_term_cfg("actor", "joint_vel").noise
+    return ranges.lin_vel_x[1], ranges.ang_vel_z[0], pushes["x"][0], noise.n_max
+
+
+def test_difficulty_drives_commands_pushes_and_noise(make_growing):
+    env = make_growing(command_from=0.5, push_from=0.0, noise_from=0.2)
+    last = (1.0, -0.5, -0.5, 1.5)
+    assert in_use(env) == pytest.approx((0.5, -0.25, 0.0, 0.3))
+    for _ in range(2):
+        end_episodes(env, 100, False, 0.9)
+    assert in_use(env) == pytest.approx((0.75, -0.375, -0.25, 0.9))
+    twist = env.command_manager.get_term("twist").command
+    assert twist[:, :2].abs().max() <= 0.75
+    for _ in range(2):
+        end_episodes(env, 100, False, 0.9)
+    assert in_use(env) == last
+    # Nothing of this is in the config, which is recorded with a run.
+    cfg = env.cfg
+    assert cfg.commands["twist"].ranges.lin_vel_x == (-1.0, 1.0)
+    assert cfg.events["push_robot"].params["velocity_range"]["x"] == (-0.5, 0.5)
+    assert cfg.observations["actor"].terms["joint_vel"].noise.n_max == 1.5
+
+
+def test_ranges_of_another_curriculum_are_grown_to(make_growing):
+    env = make_growing()
+    end_episodes(env, 100, False, 0.9)
+    env.command_manager.get_term_cfg("twist").ranges.lin_vel_x = (-1.5, 2.0)
+    for _ in range(2):
+        end_episodes(env, 10, False, 0.9)
+    assert in_use(env)[:2] == pytest.approx((2.0 * 0.625, -0.5 * 0.625))
+
+
+def test_difficulty_resumes_exactly(make_growing):
+    env, other = make_growing(), make_growing()
+    end_episodes(env, 100, False, 0.9)
+    end_episodes(env, 60, False, 0.9)
+    other.load_state_dict(env.state_dict())
+    assert in_use(other) == in_use(env)
+    for one in (env, other):
+        assert end_episodes(one, 60, False, 0.9) == 0.5
+    assert in_use(other) == in_use(env)
+
+
+def test_evaluations_in_between_do_not_count(make_growing):
+    env = make_growing(interval=10)
+    before = difficulty(env)._tally.clone()
+    with env.common_steps_held():
+        env.termination_manager.terminated.fill_(True)
+        env.step(torch.zeros(2, env.action_manager.total_action_dim))
+        env.reset()
+    assert torch.equal(difficulty(env)._tally, before)
+
+
+def test_difficulty_is_dropped_with_the_rest():
+    cfg = load_env_cfg(GO1)
+    kept = dict(cfg.curriculum)
+    grow_difficulty(cfg, "track_linear_velocity", 0.5)
+    drop_easing(cfg)
+    assert cfg.curriculum == kept
+
+
+def test_tracking_needs_a_reward_of_positive_weight(make_growing):
+    with pytest.raises(ValueError, match="dof_pos_limits"):
+        make_growing(reward_name="dof_pos_limits")

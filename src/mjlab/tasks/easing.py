@@ -283,8 +283,9 @@ class GrowingDifficulty(Easing):
         steps = env.common_step_counter - self._episode_start[env_ids]
         enough = math.ceil(min(survival_s, env.max_episode_length_s) / env.step_dt - 1e-6)
         survived = steps >= enough
-        fell = env.termination_manager.terminated[env_ids] & (steps > 0) & ~survived
-        reward = env.reward_manager.episode_sum(reward_name)[env_ids]
+        has_moved = steps > 0
+        fell = env.termination_manager.terminated[env_ids] & has_moved & ~survived
+        reward = env.reward_manager.episode_sum(reward_name)[env_ids] * has_moved
         self._tally += torch.stack(
             [part.sum().double() for part in (survived, fell, reward, steps)]
         )

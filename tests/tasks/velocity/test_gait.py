@@ -1,0 +1,361 @@
+"""The gait clock, terms that follow it, and gait metrics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from velocity_tasks import task_cfg
+
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.managers import ObservationTermCfg, RewardTermCfg, SceneEntityCfg
+from mjlab.tasks.velocity import mdp
+from mjlab.tasks.velocity.gait_figures import GAIT_FIGURES
+from mjlab.tasks.velocity.symmetry import mirror_left_right
+
+GO1 = "Mjlab-Velocity-Flat-Unitree-Go1"
+G1 = "Mjlab-Velocity-Flat-Unitree-G1"
+OFFSETS = {G1: (0.0, 0.5), GO1: (0.0, 0.5, 0.5, 0.0)}
+REST_HEIGHT = {G1: 0.0, GO1: 0.0225}
+SITES = {G1: ("left_foot", "right_foot"), GO1: ("FR", "FL", "RR", "RL")}
+BODIES = {G1: (".*_ankle_roll_link",), GO1: (".*_calf",)}
+
+
+def gait_cfg(task: str = G1, num_envs: int = 4, clock_first: bool = False):
+    cfg = task_cfg(task, num_envs)
+    cfg.events = {name: cfg.events[name] for name in ("reset_base", "reset_robot_joints")}
+    cfg.curriculum = {}
+    clock = {"gait": mdp.GaitClockCommandCfg()}
+    cfg.commands = {**clock, **cfg.commands} if clock_first else {**cfg.commands, **clock}
+    for group in ("actor", "critic"):
+        cfg.observations[group].terms["gait"] = ObservationTermCfg(
+            func=mdp.generated_commands, params={"command_name": "gait"}
+        )
+    cfg.rewards = {
+        "height": RewardTermCfg(
+            func=mdp.feet_height_by_phase,
+            weight=1.0,
+            params={
+                "height_sensor_name": "foot_height_scan",
+                "offsets": OFFSETS[task],
+                "rest_height": REST_HEIGHT[task],
+            },
+        ),
+    }
+    return cfg
+
+
+@pytest.fixture
+def make_env() -> Iterator[Any]:
+    built: list[ManagerBasedRlEnv] = []
+
+    def make(*args: Any, edit: Any = None, **kwargs: Any) -> ManagerBasedRlEnv:
+        cfg = gait_cfg(*args, **kwargs)
+        if edit is not None:
+            edit(cfg)
+        env = ManagerBasedRlEnv(cfg, device="cpu")
+        built.append(env)
+        env.reset()
+        return env
+
+    yield make
+    for env in built:
+        env.close()
+
+
+def command(env: ManagerBasedRlEnv, *rows: tuple[float, float, float]) -> None:
+    twist: Any = env.command_manager.get_term("twist")
+    twist.vel_command_b[:] = torch.tensor(rows)
+
+
+def clock(env: ManagerBasedRlEnv) -> mdp.GaitClockCommand:
+    term = env.command_manager.get_term("gait")
+    assert isinstance(term, mdp.GaitClockCommand)
+    return term
+
+
+def no_action(env: ManagerBasedRlEnv) -> torch.Tensor:
+    return torch.zeros(env.num_envs, env.action_manager.total_action_dim)
+
+
+# The clock.
+
+
+def test_the_phase_advances_by_its_frequency_from_a_random_start(make_env):
+    env = make_env(num_envs=64)
+    start = clock(env).cycles.clone()
+    assert start.std() > 0.2
+    assert start.min() >= 0.0
+    for _ in range(5):
+        env.step(no_action(env))
+    advanced = torch.remainder(clock(env).cycles - start, 1.0)
+    torch.testing.assert_close(advanced, torch.full_like(advanced, 1.5 * 5 * env.step_dt))
+
+
+def test_a_reset_redraws_the_phase_of_its_environments_only(make_env):
+    env = make_env()
+    before = clock(env).cycles.clone()
+    env.reset(env_ids=torch.tensor([1, 3]))
+    after = clock(env).cycles
+    assert (after[[0, 2]] == before[[0, 2]]).all()
+    assert (after[[1, 3]] != before[[1, 3]]).all()
+
+
+@pytest.mark.parametrize("clock_first", [False, True])
+def test_the_clock_shows_sine_and_cosine_and_zero_where_the_robot_should_stand(
+    make_env, clock_first
+):
+    env = make_env(clock_first=clock_first)
+    command(env, (0.5, 0.0, 0.0), (0.05, 0.0, 0.04), (0.0, 0.0, 0.0), (0.0, 0.0, -0.2))
+    phase = clock(env).phase
+    expected = torch.stack((phase.sin(), phase.cos()), dim=1)
+    expected[[1, 2]] = 0.0
+    seen = env.observation_manager.compute_group("actor")
+    assert isinstance(seen, torch.Tensor)
+    torch.testing.assert_close(seen[:, -2:], expected)
+    assert clock(env).is_standing.tolist() == [False, True, True, False]
+
+
+def test_a_clock_without_a_velocity_command_always_runs(make_env):
+    def edit(cfg: Any) -> None:
+        cfg.commands["gait"].velocity_command_name = None
+
+    env = make_env(edit=edit)
+    command(env, *[(0.0, 0.0, 0.0)] * 4)
+    assert clock(env).command.norm(dim=1).tolist() == pytest.approx([1.0] * 4)
+
+
+def test_observation_and_reward_read_one_phase(make_env):
+    """A reward is of the heights and the phase that the policy saw."""
+    env = make_env()
+    for _ in range(3):
+        seen, *_ = env.step(no_action(env))
+        sine = seen["actor"][:, -2]
+        heights = env.scene["foot_height_scan"].data.heights.clone()
+        target = 0.09 * torch.stack((sine.clamp(min=0), (-sine).clamp(min=0)), dim=1).square()
+        expected = torch.exp(-(heights - target).square().sum(dim=1) / 0.005)
+        _, reward, *_ = env.step(no_action(env))
+        torch.testing.assert_close(reward, expected * env.step_dt)
+
+
+def test_the_phase_resumes_exactly(make_env):
+    env, other = make_env(), make_env()
+    for _ in range(3):
+        env.step(no_action(env))
+    state = env.state_dict()
+    other.load_state_dict(state)
+    for _ in range(3):
+        seen, resumed = (one.step(no_action(one)) for one in (env, other))
+        assert torch.equal(seen[0]["actor"][:, -2:], resumed[0]["actor"][:, -2:])
+        assert torch.equal(seen[1], resumed[1])
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"frequency": 0.0}, "frequency"),
+        ({"velocity_command_name": "twst"}, "twst.*twist"),
+    ],
+)
+def test_a_clock_that_cannot_run_is_refused(make_env, fields, message):
+    def edit(cfg: Any) -> None:
+        cfg.commands["gait"] = mdp.GaitClockCommandCfg(**fields)
+
+    with pytest.raises(ValueError, match=message):
+        make_env(edit=edit)
+
+
+# Its mirror image.
+
+
+@pytest.mark.parametrize("task", [G1, GO1])
+def test_the_mirrored_clock_is_half_a_cycle_ahead(make_env, task):
+    env = make_env(task, num_envs=2)
+    command(env, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    groups = env.observation_manager.compute(update_history=True)
+    seen = TensorDict(dict(groups), batch_size=[2])
+    both, _ = mirror_left_right(env, seen)
+    twice, _ = mirror_left_right(env, both[2:])
+    ahead = clock(env).phase + math.pi
+    for group in ("actor", "critic"):
+        image = both[group][2:, -2:]
+        assert image[0].tolist() == pytest.approx(
+            [math.sin(ahead[0]), math.cos(ahead[0])], abs=1e-6
+        )
+        assert image[1].tolist() == [0.0, 0.0]
+        torch.testing.assert_close(twice[group][2:], seen[group], rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("task", [G1, GO1])
+def test_targets_of_the_mirrored_clock_are_those_of_the_other_side(make_env, task):
+    env = make_env(task, num_envs=2)
+    command(env, (1.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    heights = env.scene["foot_height_scan"].data.heights
+    feet = len(OFFSETS[task])
+    swapped = [1, 0, 3, 2][:feet]
+    heights[0] = REST_HEIGHT[task] + 0.02 * torch.arange(feet)
+    heights[1] = heights[0, swapped]
+    clock(env).cycles[:] = torch.tensor([0.1, 0.6])
+    params = env.reward_manager.get_term_cfg("height").params
+    reward = mdp.feet_height_by_phase(env, **params)
+    assert reward[0].item() == pytest.approx(reward[1].item(), rel=1e-5)
+
+
+# Terms.
+
+
+@pytest.mark.parametrize("task", [G1, GO1])
+def test_the_reward_of_heights_is_one_on_target_and_less_off_it(make_env, task):
+    env = make_env(task)
+    command(env, *[(1.0, 0.0, 0.0)] * 3, (0.0, 0.0, 0.0))
+    clock(env).cycles[:] = torch.tensor([0.25, 0.75, 0.5, 0.25])
+    first, second = [1.0, 0.0, 0.0, 1.0], [0.0, 1.0, 1.0, 0.0]
+    feet = len(OFFSETS[task])
+    swing = torch.tensor([first, second, [0.0] * 4, [0.0] * 4])[:, :feet]
+    heights = env.scene["foot_height_scan"].data.heights
+    heights[:] = 0.09 * swing + REST_HEIGHT[task]
+    params = env.reward_manager.get_term_cfg("height").params
+    assert mdp.feet_height_by_phase(env, **params).tolist() == pytest.approx([1.0] * 4)
+    heights[:, 0] += 0.03
+    expected = [math.exp(-(0.03**2) / 0.005)] * 4
+    assert mdp.feet_height_by_phase(env, **params).tolist() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        ({"offsets": (0.0,)}, "left_foot.*right_foot"),
+        ({"variance": 0.0}, "variance"),
+        ({"command_name": "twist"}, "GaitClockCommand"),
+    ],
+)
+def test_a_reward_of_heights_that_does_not_fit_is_refused(make_env, params, message):
+    def edit(cfg: Any) -> None:
+        cfg.rewards["height"].params |= params
+
+    with pytest.raises(ValueError, match=message):
+        make_env(edit=edit)
+
+
+def test_joint_deviations_are_weighted_by_pattern(make_env):
+    def edit(cfg: Any) -> None:
+        params = {"weights": {".*knee.*": 3.0, "(?!.*knee).*": 0.5}}
+        cfg.rewards["pose"] = RewardTermCfg(
+            func=mdp.weighted_joint_deviation, weight=1.0, params=params
+        )
+
+    env = make_env(edit=edit)
+    robot = env.scene["robot"]
+    term = env.reward_manager.get_term_cfg("pose")
+    position = robot.data.default_joint_pos.clone()
+    position[1] += 0.1
+    robot.write_joint_state_to_sim(position, torch.zeros_like(position))
+    joints = len(robot.joint_names)
+    expected = [0.0, 0.01 * (2 * 3.0 + (joints - 2) * 0.5), 0.0, 0.0]
+    assert term.func(env, **term.params).tolist() == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        ({".*": 1.0, "kne": 1.0}, "kne"),
+        ({".*knee.*": 1.0}, "left_hip_pitch_joint"),
+        ({".*": -1.0}, "at least 0"),
+    ],
+)
+def test_weights_that_do_not_fit_the_joints_are_refused(make_env, weights, message):
+    def edit(cfg: Any) -> None:
+        cfg.rewards["pose"] = RewardTermCfg(
+            func=mdp.weighted_joint_deviation, weight=1.0, params={"weights": weights}
+        )
+
+    with pytest.raises(ValueError, match=message):
+        make_env(edit=edit)
+
+
+def tilted(task: str, **feet: Any) -> Any:
+    def edit(cfg: Any) -> None:
+        params = {"asset_cfg": SceneEntityCfg("robot", **feet)}
+        cfg.rewards["tilt"] = RewardTermCfg(func=mdp.feet_tilt, weight=1.0, params=params)
+
+    return edit
+
+
+@pytest.mark.parametrize("task", [G1, GO1])
+@pytest.mark.parametrize("kind", ["site_names", "body_names"])
+def test_feet_are_level_in_the_default_pose_and_tilt_with_the_robot(make_env, task, kind):
+    feet = {"site_names": SITES, "body_names": BODIES}[kind][task]
+    env = make_env(task, edit=tilted(task, **{kind: feet}))
+    robot = env.scene["robot"]
+    term = env.reward_manager.get_term_cfg("tilt")
+    position = robot.data.default_joint_pos.clone()
+    robot.write_joint_state_to_sim(position, torch.zeros_like(position))
+    pose = robot.data.default_root_state[:, :7].clone()
+    # Of yaw, roll and pitch only the latter two tilt, each as far.
+    half = 0.2
+    axes = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    angle = torch.tensor([0.0, half, half, half]).unsqueeze(1)
+    pose[:, 3:] = torch.cat((angle.cos(), angle.sin() * axes), dim=1)
+    robot.write_root_link_pose_to_sim(pose)
+    env.sim.forward()
+    tilt = term.func(env, **term.params)
+    count = len(OFFSETS[task])
+    assert tilt[:2].tolist() == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert tilt[2:].max().item() <= count * math.sin(2 * half) ** 2 + 1e-6
+    assert tilt[2:].tolist() == pytest.approx([count * math.sin(2 * half) ** 2] * 2, rel=1e-3)
+
+
+def test_feet_must_be_named(make_env):
+    with pytest.raises(ValueError, match="site_names or body_names"):
+        make_env(edit=tilted(G1))
+
+
+# Metrics.
+
+
+def test_gait_metrics_agree_with_what_they_are_made_of(make_env):
+    env = make_env(GO1)
+    torch.manual_seed(0)
+    for _ in range(30):
+        env.step(0.1 * torch.randn_like(no_action(env)))
+    robot = env.scene["robot"]
+    values = {name: func(env) for name, func in GAIT_FIGURES.items()}
+    assert all(value.shape == (4,) and value.isfinite().all() for value in values.values())
+    torque = robot.data.qfrc_actuator
+    torch.testing.assert_close(values["joint_torque"], torque.abs().mean(dim=1))
+    power = (torque * robot.data.joint_vel).abs().sum(dim=1)
+    torch.testing.assert_close(values["mechanical_power"], power)
+    # Of the Go1, all gears are 1, and forces are clipped to the limits.
+    limits = torch.tensor(env.sim.mj_model.actuator_forcerange[:, 1], dtype=torch.float32)
+    share = (robot.data.actuator_force.abs() / limits).amax(dim=1)
+    torch.testing.assert_close(values["torque_share"], share)
+    assert 0.0 < values["torque_share"].max() <= 1.0 + 1e-6
+    in_contact = env.scene["feet_ground_contact"].data.found > 0
+    assert in_contact.any()
+    ids = [robot.site_names.index(name) for name in SITES[GO1]]
+    speed = robot.data.site_lin_vel_w[:, ids, :2].norm(dim=-1)
+    slowest = torch.where(in_contact, speed, torch.inf).amin(dim=1)
+    fastest = torch.where(in_contact, speed, 0.0).amax(dim=1)
+    touches = in_contact.any(dim=1)
+    slip = values["foot_slip"]
+    assert (slip >= torch.where(touches, slowest, 0.0) - 1e-6).all()
+    assert (slip <= fastest + 1e-6).all()
+
+
+def test_the_action_rate_does_not_depend_on_the_scale_of_actions(make_env):
+    rates = []
+    for scale in (0.25, 0.5):
+
+        def edit(cfg: Any, scale: float = scale) -> None:
+            cfg.actions["joint_pos"].scale = scale
+
+        env = make_env(GO1, edit=edit)
+        for target in (0.1, -0.2):
+            env.step(torch.full_like(no_action(env), target / scale))
+        rates.append(GAIT_FIGURES["action_rate"](env).tolist())
+    assert rates[0] == pytest.approx(rates[1])
+    assert rates[0] == pytest.approx([0.3] * 4)
