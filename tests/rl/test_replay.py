@@ -28,10 +28,12 @@ class History:
     def __init__(self, num_steps: int, kinds: list[list[int]]) -> None:
         self.offsets = 100.0 * torch.arange(NUM_ENVS)
         self.kinds = kinds
+        self.ends: list[tuple[int, int]] = []
         self.storage = ReplayStorage(num_steps, observation(self.offsets), ["actor"], 1)
         for step, of_envs in enumerate(kinds, start=1):
             kind = torch.tensor(of_envs)
             known = (kind == TIMED_OUT).nonzero().flatten()
+            self.ends += [(env, step - 1) for env in known.tolist()]
             reached = self.offsets + step
             self.storage.add(
                 actions=reached[:, None],
@@ -60,6 +62,10 @@ class History:
                 kind, taken = self.kinds[step + ahead][env], ahead + 1
                 if kind != GOES_ON:
                     break
+            last = (env, step + taken - 1)
+            if kind == TIMED_OUT and last not in self.ends[-NUM_ENVS:]:
+                # There is room for no more ends than environments here.
+                kind = CUT_OFF
             reached = 100.0 * env + step + taken
             assert batch.actions[i].item() == 100.0 * env + step + 1
             assert batch.returns[i].item() == pytest.approx(expected, rel=1e-5)
@@ -114,7 +120,7 @@ def test_contents_survive_a_file(tmp_path):
     files.write(history.storage)
     restored = History(4, [])
     files.read(restored.storage)
-    restored.kinds = history.kinds
+    restored.kinds, restored.ends = history.kinds, history.ends
     restored.check(2, 0.9)
     one, other = (
         replay.storage.sample(50, 0.9, 3, torch.Generator().manual_seed(1))

@@ -343,13 +343,13 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         checkpoint["training_state"] = training_state.capture(
             self.env, self.alg, self.logger, observations
         )
-        replays = ReplayFiles(path) if self._saves_replay else None
-        if replays is not None:
+        replay = self._replay if self.cfg["algorithm"].get("save_replay") else None
+        if replay is not None:
             # First, so that the newest checkpoint always has one, whenever writing is interrupted.
-            replays.write(self.alg.storage)
+            ReplayFiles(path).write(replay)
         save_checkpoint(checkpoint, path)
-        if replays is not None:
-            replays.remove_others()
+        if replay is not None:
+            ReplayFiles(path).remove_others()
         if self.cfg.get("upload_model", True):
             self.logger.save_model(path, max(done - 1, 0))
 
@@ -389,8 +389,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if counter is not None:
             self.env.unwrapped.common_step_counter = counter
         self._state_to_resume = checkpoint.get("training_state") if load_cfg is None else None
-        if load_cfg is None and isinstance(self.alg.storage, ReplayStorage):
-            ReplayFiles(path).read(self.alg.storage)
+        if load_cfg is None and self._replay is not None:
+            ReplayFiles(path).read(self._replay)
         self._observations = None
         return infos
 
@@ -549,10 +549,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         return self.gpu_global_rank == 0
 
     @property
-    def _saves_replay(self) -> bool:
-        return bool(self.cfg["algorithm"].get("save_replay")) and isinstance(
-            self.alg.storage, ReplayStorage
-        )
+    def _replay(self) -> ReplayStorage | None:
+        storage: Any = getattr(self.alg, "storage", None)
+        return storage if isinstance(storage, ReplayStorage) else None
 
     @property
     def _uses_rnd(self) -> bool:

@@ -90,7 +90,7 @@ class SAC:
         self._pessimistic = pessimistic
         self._log_alpha = nn.Parameter(torch.tensor(math.log(init_alpha), device=device))
         self._log_alpha_range = (math.log(alpha_range[0]), math.log(alpha_range[1]))
-        num_actions = actor.distribution.output_dim
+        num_actions = _of(actor).output_dim
         self._target_entropy = num_actions * math.log(target_std * math.sqrt(2 * math.pi * math.e))
         groups = [
             {"params": list(self.critic.parameters()), "lr": critic_learning_rate},

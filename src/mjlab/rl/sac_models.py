@@ -56,8 +56,8 @@ class SquashedGaussian(Distribution):
         self._mean = self._log_std = torch.zeros(0)
 
     @property
-    def input_dim(self) -> list[int]:
-        return [2, self.output_dim]
+    def input_dim(self) -> int:
+        return 2 * self.output_dim
 
     def init_mlp_weights(self, mlp: nn.Module) -> None:
         """Begin in the middle of the action range, whatever is observed (Seo et al., 2512.01996)."""
@@ -69,7 +69,7 @@ class SquashedGaussian(Distribution):
             last.bias[self.output_dim :] = math.atanh(2.0 * share - 1.0)
 
     def update(self, mlp_output: torch.Tensor) -> None:
-        self._mean, raw = mlp_output.float().unbind(dim=-2)
+        self._mean, raw = mlp_output.float().chunk(2, dim=-1)
         # Bounded smoothly, because a clamped value has no gradient that would bring it back.
         share = 0.5 * (torch.tanh(raw) + 1.0)
         self._log_std = self._low + (self._high - self._low) * share
@@ -90,10 +90,10 @@ class SquashedGaussian(Distribution):
         return torch.tanh(u), (normal - jacobian).sum(dim=-1)
 
     def deterministic_output(self, mlp_output: torch.Tensor) -> torch.Tensor:
-        return torch.tanh(mlp_output[..., 0, :])
+        return torch.tanh(mlp_output[..., : self.output_dim])
 
     def as_deterministic_output_module(self) -> nn.Module:
-        return _TanhOfMean()
+        return _TanhOfMean(self.output_dim)
 
     @property
     def mean(self) -> torch.Tensor:
@@ -113,8 +113,12 @@ class SquashedGaussian(Distribution):
 
 
 class _TanhOfMean(nn.Module):
+    def __init__(self, num_actions: int) -> None:
+        super().__init__()
+        self._num_actions = num_actions
+
     def forward(self, mlp_output: torch.Tensor) -> torch.Tensor:
-        return torch.tanh(mlp_output[..., 0, :])
+        return torch.tanh(mlp_output[..., : self._num_actions])
 
 
 def normalized_mlp(
@@ -135,12 +139,11 @@ class SacActorModel(MLPModel):
     def __init__(self, *args: Any, hidden_dims: Sequence[int], activation: str, **kwargs: Any):
         """Take the arguments of rsl_rl's `MLPModel`."""
         super().__init__(*args, hidden_dims=tuple(hidden_dims), activation=activation, **kwargs)
-        assert self.distribution is not None
-        size = int(torch.Size(self.distribution.input_dim).numel())
-        mlp = normalized_mlp(self._get_latent_dim(), size, hidden_dims, activation)
-        mlp.append(nn.Unflatten(-1, tuple(self.distribution.input_dim)))
-        self.distribution.init_mlp_weights(mlp)
-        self.mlp = mlp
+        distribution = self.distribution
+        assert isinstance(distribution, SquashedGaussian)
+        inputs, outputs = self._get_latent_dim(), distribution.input_dim
+        self.mlp = normalized_mlp(inputs, outputs, hidden_dims, activation)
+        distribution.init_mlp_weights(self.mlp)
 
 
 class TwinCriticModel(MLPModel):
@@ -148,6 +151,8 @@ class TwinCriticModel(MLPModel):
 
     The return is one of `num_atoms` values, evenly spaced over `value_range`.
     """
+
+    atoms: torch.Tensor
 
     def __init__(
         self,
