@@ -34,8 +34,8 @@ from mjlab.rl.image_encoders import (
 from mjlab.rl.migration import check_fits, check_optimizer_fits, migrate
 from mjlab.rl.network_checks import check_networks
 from mjlab.rl.onnx_export import export_to_onnx
-from mjlab.rl.replay import ReplayFiles, ReplayStorage
 from mjlab.rl.progress import IterationStats, TrainingObserver
+from mjlab.rl.replay import ReplayFiles, ReplayStorage
 from mjlab.rl.rsl import (
     OnPolicyRunner,
     TensorDict,
