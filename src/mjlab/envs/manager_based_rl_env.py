@@ -50,6 +50,10 @@ class ManagerBasedRlEnv:
     """N environments stepped together. All tensors have a leading dimension N.
 
     Call `reset` before the first `step`: the constructor leaves the model's initial state.
+
+    Attributes:
+        observes_ends: Have `step` return the observations in which episodes run out of time. False
+            at first; learners that bootstrap from them switch it on.
     """
 
     is_vector_env = True
@@ -88,6 +92,7 @@ class ManagerBasedRlEnv:
         if self.scene.sensor_context is not None:
             self.sim.set_sensor_context(self.scene.sensor_context)
 
+        self.observes_ends = False
         self.common_step_counter = 0
         self._holds_common_steps = False
         self._sim_step_counter = 0
@@ -97,7 +102,7 @@ class ManagerBasedRlEnv:
         # What `_command_dt` returns in a step with resets. Kept, because torch counts no writes to a
         # tensor made under `inference_mode`, and by these a `Lookup` knows that it is valid.
         self._command_dts = torch.zeros(self.num_envs, dtype=torch.float32, device=device)
-        self._ended = Lookup()
+        self._ended, self._timed_out = Lookup(), Lookup()
         self._looks_ahead = torch.device(device).type == "cuda"
         self._renderer: OffscreenRenderer | None = None
         self._renderer_is_open = False
@@ -255,7 +260,7 @@ class ManagerBasedRlEnv:
         env_ids = as_reset_ids(env_ids, self.num_envs, self.device)
         if seed is not None:
             self.seed(seed)
-        self.extras["log"] = {}
+        self._clear_extras()
         stepped = env_ids[self.episode_length_buf[env_ids] > 0]
         if len(stepped) > 0:
             self.recorder_manager.record_pre_reset(stepped)
@@ -292,6 +297,13 @@ class ManagerBasedRlEnv:
         A command that writes positions, and a term that writes `sim.data` itself, runs
         `sim.forward(env_ids)`, on the environments concerned.
 
+        With `observes_ends` and `auto_reset`, steps in which episodes run out of time (truncated and
+        not terminated) observe these k environments before they are reset.
+        `extras["final_observations"]` is what `step` would have returned for them had the episodes
+        gone on, group to (k, ...), and `extras["final_ids"]` are their ids (k,), ascending. Only
+        commands are those that acted in the step: they have neither advanced nor been redrawn.
+        Other steps have neither entry. Trajectories do not depend on the switch.
+
         Args:
             action: (N, A) float tensor; an array or a list is converted.
 
@@ -306,7 +318,7 @@ class ManagerBasedRlEnv:
         """
         if not self.cfg.auto_reset:
             self._refuse_pending_resets()
-        self.extras["log"] = {}
+        self._clear_extras()
         self.action_manager.process_action(as_action(action, self.device))
         self._run_physics()
         self.episode_length_buf += 1
@@ -325,6 +337,8 @@ class ManagerBasedRlEnv:
                 self.event_manager.apply(mode=mode, dt=self.step_dt)
 
         moved = self.scene.take_moved_envs()
+        if self.observes_ends and self.cfg.auto_reset:
+            self._observe_ends(moved)
         reset_ids = self._reset_done_envs()
         command_dt = self._command_dt(reset_ids)
         if self._looks_ahead and len(reset_ids) > 0:
@@ -401,7 +415,43 @@ class ManagerBasedRlEnv:
         ]
         if self.cfg.auto_reset:
             lookups.append(self._ended.plan(self.reset_buf, self.reset_buf))
+            if self.observes_ends:
+                flags = self.reset_time_outs, self.reset_terminated
+                lookups.append(self._timed_out.plan(flags[0] & ~flags[1], *flags))
         look_up(lookups)
+
+    def _clear_extras(self) -> None:
+        self.extras["log"] = {}
+        for name in ("final_observations", "final_ids"):
+            self.extras.pop(name, None)
+
+    def _observe_ends(self, moved: torch.Tensor | None) -> None:
+        """Put the observations of episodes that run out of time into `extras`; see `step`.
+
+        What resets and curricula read (derived quantities, rays, images, random numbers) is left as
+        it would be without.
+
+        Args:
+            moved: (N,) bool, environments in which an event placed something; None for nowhere.
+        """
+        flags = self.reset_time_outs, self.reset_terminated
+        ids = self._timed_out.take(*flags)
+        if ids is None:
+            ids = (flags[0] & ~flags[1]).nonzero().flatten()
+        if len(ids) == 0:
+            return
+        with self.sim.looking_ahead(ids):
+            if moved is not None and len(placed := ids[moved[ids]]) > 0:
+                self.sim.forward(placed)
+            self.sim.sense()
+            observations = self.observation_manager.preview()
+        self.extras["final_observations"] = {
+            name: value[ids]
+            if isinstance(value, torch.Tensor)
+            else {term: part[ids] for term, part in value.items()}
+            for name, value in observations.items()
+        }
+        self.extras["final_ids"] = ids
 
     def _reset_done_envs(self) -> torch.Tensor:
         """Reset environments that are done, under `auto_reset`; return their ids."""

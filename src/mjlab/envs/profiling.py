@@ -37,7 +37,7 @@ _MANAGERS = {
     "events": ("event_manager", ("apply", "reset")),
     "curriculum": ("curriculum_manager", ("compute", "reset")),
     "commands": ("command_manager", ("compute", "reset")),
-    "observations": ("observation_manager", ("compute", "reset")),
+    "observations": ("observation_manager", ("compute", "preview", "reset")),
     "recorders": (
         "recorder_manager",
         ("record_pre_reset", "record_post_reset", "record_post_step"),

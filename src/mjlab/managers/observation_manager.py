@@ -18,6 +18,8 @@ from mjlab.managers.observation_group import ObservationGroupCfg as ObservationG
 from mjlab.managers.observation_group import check_group
 from mjlab.managers.observation_term import ObservationTerm as ObservationTerm
 from mjlab.managers.observation_term import ObservationTermCfg as ObservationTermCfg
+from mjlab.utils.random import preserved_rng
+from mjlab.utils.state import capture_state, is_stateful, restore_state
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -96,6 +98,21 @@ class ObservationManager(ManagerBase):
                 name: group.compute(update_history, env_ids) for name, group in self._groups.items()
             }
         return self._obs_buffer
+
+    def preview(self) -> dict[str, Observation]:
+        """Return what `compute(update_history=True)` would return.
+
+        Delays, histories, noise models, terms that are classes, and random number generators stay
+        where they are.
+        """
+        terms = [term for term in self._class_terms.values() if is_stateful(term)]
+        parts = [*self._stateful_terms, *terms]
+        before = [capture_state(part) for part in parts]
+        with preserved_rng():
+            previewed = {name: group.compute(True, None) for name, group in self._groups.items()}
+        for part, state in zip(parts, before, strict=True):
+            restore_state(part, state)
+        return previewed
 
     def compute_group(
         self,

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.rl.evaluation_result import Episodes, EvaluationResult, summarize
-from mjlab.rl.rng import preserved_rng
 from mjlab.rl.threads import threads_for_policy
+from mjlab.utils.random import preserved_rng
 
 if TYPE_CHECKING:
     from mjlab.rl.vecenv_wrapper import RslRlVecEnvWrapper

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import random
-from collections.abc import Generator
 from typing import Any
 
 import numpy as np
@@ -50,13 +48,3 @@ def set_rng_state(state: dict[str, Any]) -> None:
     if "cuda" in state and torch.cuda.is_available():
         for device, value in enumerate(state["cuda"][: torch.cuda.device_count()]):
             torch.cuda.set_rng_state(value.cpu(), device)
-
-
-@contextlib.contextmanager
-def preserved_rng() -> Generator[None]:
-    """Put all generators back, after the block, to where they were before it."""
-    state = rng_state()
-    try:
-        yield
-    finally:
-        set_rng_state(state)

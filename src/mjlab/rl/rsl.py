@@ -119,6 +119,7 @@ else:
 os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
 
 with _import_context:
+    from rsl_rl.algorithms import PPO as PPO
     from rsl_rl.env import VecEnv as VecEnv
     from rsl_rl.models import CNNModel as CNNModel
     from rsl_rl.models import MLPModel as MLPModel

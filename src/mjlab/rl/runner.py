@@ -37,6 +37,7 @@ from mjlab.rl.onnx_export import export_to_onnx
 from mjlab.rl.progress import IterationStats, TrainingObserver
 from mjlab.rl.replay import ReplayFiles, ReplayStorage
 from mjlab.rl.rsl import (
+    PPO,
     OnPolicyRunner,
     TensorDict,
     VecEnv,
@@ -172,6 +173,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     def _start(self, init_at_random_ep_len: bool) -> TensorDict:
         """Return the observations to start from: resumed ones, or those of the environments."""
         self.alg.train_mode()
+        # Here and not in the wrapper, which playing and evaluating use as well.
+        if self._uses_final_observations and hasattr(self.env, "observe_ends"):
+            self.env.observe_ends()
         if self.is_distributed:
             self.alg.broadcast_parameters()
         observations = self._resumed_observations()
@@ -222,10 +226,46 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 check_nan(observations, rewards, dones)
             observations = observations.to(self.device)
             rewards, dones = rewards.to(self.device), dones.to(self.device)
-            self.alg.process_env_step(observations, rewards, dones, extras)
+            credited, told = self._bootstrapped(observations, rewards, extras)
+            self.alg.process_env_step(observations, credited, dones, told)
             intrinsic = self.alg.intrinsic_rewards if self._uses_rnd else None
             self.logger.process_env_step(rewards, dones, extras, intrinsic)
         return observations
+
+    def _bootstrapped(
+        self, observations: TensorDict, rewards: torch.Tensor, extras: dict[str, Any]
+    ) -> tuple[torch.Tensor, dict[str, Any]]:
+        """Return rewards and extras for the algorithm, in which PPO's time-outs are bootstrapped.
+
+        At a time-out rsl_rl's PPO adds gamma V(s), s being the observation before the step. With
+        final observations s', gamma V(s') is added here, and these time-outs are marked no more.
+        """
+        is_ours = isinstance(self.alg, PPO) and "time_outs" in extras
+        if not is_ours or "final_observations" not in extras:
+            return rewards, extras
+        final = extras["final_observations"].to(self.device)
+        ids = extras["final_ids"].to(self.device)
+        time_outs = extras["time_outs"].to(self.device)
+        # A wrapper may have found that an episode terminated after all.
+        values = self._final_values(observations, final, ids) * time_outs[ids]
+        rewards = rewards.index_add(0, ids, (self.alg.gamma * values).to(rewards.dtype))
+        return rewards, {**extras, "time_outs": time_outs.index_fill(0, ids, False)}
+
+    def _final_values(
+        self, observations: TensorDict, final: TensorDict, ids: torch.Tensor
+    ) -> torch.Tensor:
+        """Return the critic's values (k,) of `final`, observations of the environments `ids`."""
+        # Compiled models would be compiled for each k.
+        critic = self.alg._raw_critic
+        if not critic.is_recurrent:
+            return critic(final).detach().squeeze(-1)
+        # The hidden state is of all environments, and has seen the observations before the step.
+        hidden_state = critic.get_hidden_state()
+        everywhere = observations.clone()
+        everywhere[ids] = final
+        values = critic(everywhere).detach().squeeze(-1)[ids]
+        critic.reset(hidden_state=hidden_state)
+        return values
 
     def _report(
         self,
@@ -552,6 +592,11 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     def _replay(self) -> ReplayStorage | None:
         storage: Any = getattr(self.alg, "storage", None)
         return storage if isinstance(storage, ReplayStorage) else None
+
+    @property
+    def _uses_final_observations(self) -> bool:
+        """True if final observations are bootstrapped from: here for PPO, or by the algorithm."""
+        return isinstance(self.alg, PPO) or getattr(self.alg, "takes_final_observations", False)
 
     @property
     def _uses_rnd(self) -> bool:

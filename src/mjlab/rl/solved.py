@@ -14,8 +14,7 @@ from typing import Any
 from mjlab.rl.evaluate import evaluate_policy, make_evaluation_env
 from mjlab.rl.evaluation_result import FIGURES, EvaluationResult, episodes_to_show
 from mjlab.rl.progress import IterationStats
-from mjlab.rl.rng import preserved_rng
-from mjlab.utils.random import evaluation_seed
+from mjlab.utils.random import evaluation_seed, preserved_rng
 
 logger = logging.getLogger(__name__)
 

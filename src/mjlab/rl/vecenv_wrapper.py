@@ -92,6 +92,17 @@ class RslRlVecEnvWrapper(VecEnv):
     def episode_length_buf(self, value: torch.Tensor) -> None:
         self.unwrapped.episode_length_buf.copy_(value)
 
+    def observe_ends(self, enabled: bool = True) -> None:
+        """Have `step` return the observations in which episodes run out of time.
+
+        They are `extras["final_observations"]`, a TensorDict of batch size [k], and
+        `extras["final_ids"]` (k,), in steps in which k episodes do. Does nothing if time-outs are
+        not bootstrapped (`is_finite_horizon`) or the environment cannot observe them.
+        """
+        env = self.unwrapped
+        if hasattr(env, "observes_ends"):
+            env.observes_ends = enabled and not self.cfg.is_finite_horizon
+
     def seed(self, seed: int = -1) -> int:
         """Seed every random number generator; -1 draws a seed. Returns the seed used."""
         return self.unwrapped.seed(seed)
@@ -124,6 +135,10 @@ class RslRlVecEnvWrapper(VecEnv):
             # An episode that ended in a terminal state has no future to bootstrap from, even when
             # it ran out of time in the same step.
             extras["time_outs"] = truncated & ~terminated
+        if "final_observations" in extras:
+            extras["final_observations"] = TensorDict(
+                extras["final_observations"], batch_size=[len(extras["final_ids"])]
+            )
         return self._as_tensordict(observations), rewards, dones, extras
 
     def close(self) -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Generator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import mujoco
 import torch
 
 from mjlab.sensor._camera_checks import check_shared_cameras
+from mjlab.utils.state import capture_state, restore_state
 
 if TYPE_CHECKING:
     from mjlab.sensor.camera_sensor import CameraSensor
@@ -111,6 +113,18 @@ class SensorContext:
             for camera, images in zip(self._camera_sensors, render(self._views), strict=True):
                 camera.set_images(images)
         self.finalize()
+
+    @contextlib.contextmanager
+    def results_kept(self) -> Generator[None]:
+        """Put the results of all sensors back after the block, in which `sense` may be called."""
+        sensors = (*self._camera_sensors, *self._raycast_sensors)
+        before = [capture_state(sensor) for sensor in sensors]
+        try:
+            yield
+        finally:
+            for sensor, state in zip(sensors, before, strict=True):
+                restore_state(sensor, state)
+                sensor.invalidate_cache()
 
     def prepare(self) -> None:
         """Compute all rays in the world frame."""

@@ -294,6 +294,17 @@ class Engine(ABC):
         self.forward(reset_ids)
 
     @abstractmethod
+    def look_ahead(self, env_ids: torch.Tensor) -> Any:
+        """Run `forward(env_ids, "vel")`, and return for `look_back` the derived fields before it.
+
+        An engine may make the other environments current too.
+        """
+
+    @abstractmethod
+    def look_back(self, env_ids: torch.Tensor, before: Any) -> None:
+        """Put back the derived fields that `look_ahead(env_ids)` returned."""
+
+    @abstractmethod
     def reset(self, env_ids: torch.Tensor | None) -> None:
         """Put environments into the model's initial state: time 0, qpos0, everything else zero.
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from functools import cached_property
 from typing import Any
 
@@ -367,8 +368,7 @@ class Simulation:
         sensors of later stages keep their values.
         """
         self._engine.forward(self.resolve_ids(env_ids), stage)
-        for callback in self._forward_callbacks:
-            callback(stage)
+        self._tell_forward(stage)
 
     def forward_after_reset(self, env_ids: torch.Tensor) -> None:
         """Run `forward(env_ids)`, and `forward(stage="vel")` for the other environments.
@@ -378,8 +378,27 @@ class Simulation:
         resolved = self.resolve_ids(env_ids)
         assert resolved is not None
         self._engine.forward_after_reset(resolved)
-        for callback in self._forward_callbacks:
-            callback("acc")
+        self._tell_forward("acc")
+
+    @contextlib.contextmanager
+    def looking_ahead(self, env_ids: torch.Tensor) -> Generator[None]:
+        """Make positions and velocities current in some environments, for the length of the block.
+
+        After it, derived fields and the results of camera and ray sensors are what they were
+        before. In the block, fields of other environments may be current or not.
+
+        Args:
+            env_ids: Environments, (n,) int64.
+        """
+        env_ids = env_ids.to(self.device, torch.int64)
+        with contextlib.ExitStack() as undo:
+            if self._sensor_context is not None:
+                undo.enter_context(self._sensor_context.results_kept())
+            before = self._engine.look_ahead(env_ids)
+            undo.callback(self._tell_forward, "acc")
+            undo.callback(self._engine.look_back, env_ids, before)
+            self._tell_forward("vel")
+            yield
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Put environments into the model's initial state: time 0, `qpos0`, the rest zero.
@@ -391,6 +410,10 @@ class Simulation:
     def add_forward_callback(self, callback: Callable[[Stage], None]) -> None:
         """Call `callback(stage)` after every `forward`: derived fields up to a stage have changed."""
         self._forward_callbacks.append(callback)
+
+    def _tell_forward(self, stage: Stage) -> None:
+        for callback in self._forward_callbacks:
+            callback(stage)
 
     def sense(self) -> None:
         """Evaluate camera and ray sensors at the current poses; nothing without such sensors."""
@@ -502,8 +525,7 @@ class Simulation:
         self.check_state(state)
         self.expand_model_fields(tuple(state["model"]))
         self._engine.load_state_dict(state)
-        for callback in self._forward_callbacks:
-            callback("acc")
+        self._tell_forward("acc")
 
     def close(self) -> None:
         """Free what the engine holds outside Python's reach."""

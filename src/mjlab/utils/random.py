@@ -8,8 +8,10 @@ as that is below 2**20 and there are at most 1,000 processes.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
+from collections.abc import Generator
 
 import numpy as np
 import torch
@@ -50,6 +52,21 @@ def seed_rng(seed: int, torch_deterministic: bool = False) -> None:
         # The same as `use_deterministic_algorithms(True, warn_only=True)`, which would load
         # torch's compiler first (seconds).
         torch.set_deterministic_debug_mode("warn")
+
+
+@contextlib.contextmanager
+def preserved_rng() -> Generator[None]:
+    """Put the generators of Python, NumPy and torch back, after the block, to where they were."""
+    python, numpy, cpu = random.getstate(), np.random.get_state(), torch.get_rng_state()
+    gpus = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
+    try:
+        yield
+    finally:
+        random.setstate(python)
+        np.random.set_state(numpy)
+        torch.set_rng_state(cpu)
+        if gpus:
+            torch.cuda.set_rng_state_all(gpus)
 
 
 def process_seed(seed: int, rank: int) -> int:

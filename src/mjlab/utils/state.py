@@ -47,6 +47,11 @@ def stateful(cls: C) -> C:
     return cls
 
 
+def is_stateful(obj: Any) -> bool:
+    """Return True if the class of `obj` is marked `stateful`."""
+    return getattr(type(obj), _MARK, False)
+
+
 def plain_scalar(value: Any) -> Any:
     """Return `value` as exactly None, bool, int, float or str, or `SKIP` if it is none of these.
 
@@ -89,7 +94,7 @@ def restore_state(obj: Any, state: dict[str, Any]) -> None:
         if name in transient or name == _CLASS_KEY:
             continue
         current = obj.__dict__.get(name)
-        if _is_captured_object(value) and not getattr(type(current), _MARK, False):
+        if _is_captured_object(value) and not is_stateful(current):
             logger.warning(
                 "%s.%s is not restored: it was a %s and is %r now.",
                 type(obj).__name__, name, value[_CLASS_KEY], current,
@@ -149,7 +154,7 @@ def _capture_value(value: Any, seen: set[int], generators: bool) -> Any:
         return torch.from_numpy(value.copy()) if value.dtype.kind in "biuf" else SKIP
     if isinstance(value, torch.Generator):
         return value.get_state() if generators else SKIP
-    if getattr(type(value), _MARK, False):
+    if is_stateful(value):
         # An object reached twice is saved once: state is a tree.
         if id(value) in seen:
             return SKIP
@@ -186,7 +191,7 @@ def _restored(current: Any, saved: Any) -> Any:
     """Return what the attribute now holding `current` should hold to match `saved`."""
     if isinstance(saved, torch.Tensor):
         return _restored_tensor(current, saved)
-    if getattr(type(current), _MARK, False):
+    if is_stateful(current):
         restore_state(current, saved)
         return current
     if type(current) in _SEQUENCES and isinstance(saved, list):

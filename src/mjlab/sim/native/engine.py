@@ -326,6 +326,23 @@ class NativeEngine(Engine):
             columns = self._sensor_columns[stage] if name == "sensordata" else None
             self._outputs[name].copy_out(rows, columns)
 
+    def look_ahead(self, env_ids: torch.Tensor) -> Any:
+        fields = {name: field.values[env_ids] for name, field in self._outputs.items()}
+        rows = env_ids.numpy()
+        flags = self._has_velocities[rows], self._has_accelerations[rows]
+        self.forward(env_ids, "vel")
+        return fields, flags
+
+    def look_back(self, env_ids: torch.Tensor, before: Any) -> None:
+        fields, (has_velocities, has_accelerations) = before
+        for name, values in fields.items():
+            self._outputs[name].values[env_ids] = values
+        rows = env_ids.numpy()
+        self._has_velocities[rows], self._has_accelerations[rows] = (
+            has_velocities,
+            has_accelerations,
+        )
+
     def reset(self, env_ids: torch.Tensor | None) -> None:
         self._copy_in_model()
         self._call(self._batch.reset, env_ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))

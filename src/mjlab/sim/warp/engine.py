@@ -441,6 +441,20 @@ class WarpEngine(Engine):
         unwelded = dataclasses.replace(self.wp_model, body_weldid=self._unwelded)
         mjwarp.kinematics(unwelded, self.wp_data)
 
+    def look_ahead(self, env_ids: torch.Tensor) -> Any:
+        fields = {
+            name: tensor.clone()
+            for name, tensor in self._data_tensors.items()
+            if name not in _STATE_FIELDS
+        }
+        # A pass computes all environments anyway, and all are put back.
+        self.forward(None, "vel")
+        return fields
+
+    def look_back(self, env_ids: torch.Tensor, before: Any) -> None:
+        for name, values in before.items():
+            self._data_tensors[name].copy_(values)
+
     def reset(self, env_ids: torch.Tensor | None) -> None:
         # `mjwarp.reset_data` clears the contacts of all environments together with those of the
         # first, and overflow flags before they are read; so each field is reset here.
