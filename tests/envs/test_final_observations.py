@@ -85,9 +85,7 @@ def make() -> Iterator[Callable[..., ManagerBasedRlEnv]]:
     """Return a function that makes an environment, reset and ready to step."""
     made: list[ManagerBasedRlEnv] = []
 
-    def make(
-        *edits: Edit, observes_ends: bool = True, engine: str = "native"
-    ) -> ManagerBasedRlEnv:
+    def make(*edits: Edit, observes_ends: bool = True, engine: str = "native") -> ManagerBasedRlEnv:
         env = ManagerBasedRlEnv(config(engine, *edits), device="cpu")
         made.append(env)
         env.observes_ends = observes_ends
@@ -143,20 +141,17 @@ def disturb(cfg: ManagerBasedRlEnvCfg) -> None:
 
 def look_down(cfg: ManagerBasedRlEnvCfg) -> None:
     """Add rays and images that move with the pole, and observe them."""
-    pole = cfg.scene.entities["robot"] if "robot" in cfg.scene.entities else None
-    name = "robot" if pole is not None else next(iter(cfg.scene.entities))
-    body = "pole_1" if name == "cartpole" else "pole"
     cfg.scene.sensors = (
         RayCastSensorCfg(
             name="rays",
-            frame=ObjRef(type="body", name=body, entity=name),
+            frame=ObjRef(type="body", name="pole_1", entity="cartpole"),
             pattern=GridPatternCfg(size=(0.2, 0.0), resolution=0.2),
             ray_alignment="base",
             max_distance=10.0,
         ),
         CameraSensorCfg(
             name="eye",
-            parent_body=f"{name}/{body}",
+            parent_body="cartpole/pole_1",
             pos=(0.0, -1.0, 0.0),
             quat=(0.7071, 0.7071, 0.0, 0.0),
             width=8,
@@ -200,7 +195,11 @@ def test_only_steps_in_which_an_episode_runs_out_of_time_have_them(make):
     returned = steps(env)
     # Environment 1 runs out of time again.
     assert [k for k, values in enumerate(returned) if "final_ids" in values[4]] == [3, 5, 7]
-    assert [k for k, values in enumerate(returned) if "final_observations" in values[4]] == [3, 5, 7]
+    assert [k for k, values in enumerate(returned) if "final_observations" in values[4]] == [
+        3,
+        5,
+        7,
+    ]
     env.episode_length_buf[3] = 5
     assert "final_ids" in env.step(torch.zeros(NUM_ENVS, 1))[4]
     assert "final_ids" not in env.reset()[1]
@@ -233,18 +232,15 @@ def test_rays_and_images_are_of_the_state_the_episode_ended_in(make):
         assert not torch.equal(final[:, -48:], ended[step][3]["actor"][ids, -48:])
 
 
-def place(env: Any, env_ids: torch.Tensor) -> None:
-    cart = next(iter(env.scene.entities.values()))
-    cart.write_joint_position_to_sim(torch.full((len(env_ids), 2), 0.3), env_ids=env_ids)
-
-
 def test_what_an_event_placed_in_the_step_is_seen(make):
-    def placing(cfg: ManagerBasedRlEnvCfg) -> None:
-        def in_second(env: Any, env_ids: Any) -> None:
-            if env.common_step_counter == 4:
-                place(env, torch.tensor([1, 2]))
+    def place(env: Any, env_ids: Any) -> None:
+        if env.common_step_counter == 4:
+            pose = torch.full((2, 2), 0.3)
+            cartpole = env.scene["cartpole"]
+            cartpole.write_joint_position_to_sim(pose, env_ids=torch.tensor([1, 2]))
 
-        cfg.events["place"] = EventTermCfg(func=in_second, mode="step")
+    def placing(cfg: ManagerBasedRlEnvCfg) -> None:
+        cfg.events["place"] = EventTermCfg(func=place, mode="step")
 
     ended, going_on = steps(make(placing)), steps(make(placing, go_on))
     final = ended[3][4]["final_observations"]["actor"]
@@ -257,7 +253,7 @@ def test_what_an_event_placed_in_the_step_is_seen(make):
 
 def read_everything(env: Any, env_ids: Any, seen: list[torch.Tensor]) -> torch.Tensor:
     """A curriculum that reads what is derived from the state in which episodes ended."""
-    values = [pole_place(env), env.sim.data.sensordata if False else env.sim.data.cvel.flatten(1)]
+    values = [pole_place(env), env.sim.data.cvel, env.sim.data.qacc]
     if "rays" in env.scene.sensors:
         values += [env.scene["rays"].data.hit_pos_w.flatten(1), env.scene["eye"].data.depth]
     seen += [value.clone() for value in values]

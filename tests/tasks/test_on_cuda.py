@@ -144,6 +144,8 @@ def test_waits_are_counted(cuda):
 @pytest.mark.parametrize("task", list_tasks())
 def test_a_task_builds_steps_and_resets_on_the_device(cuda, task):
     env = make_env(task)
+    # Final observations are found in the same look-up.
+    env.observes_ends = True
     observations, _ = env.reset()
     actions = torch.zeros(NUM_ENVS, env.action_manager.total_action_dim, device=DEVICE)
     env.step(actions)
@@ -166,7 +168,9 @@ def test_a_task_builds_steps_and_resets_on_the_device(cuda, task):
     assert waits.total() - 1 <= MOST_WAITS_OF_RESETS, waits
     assert not cuda.rounded, "TF32 may round these; use sums of products"
     assert (returned[-1].cpu() == torch.tensor([True, True, False, False])).all()
-    for value in (*observations.values(), *returned):
+    final = extras["final_observations"]
+    assert extras["final_ids"].tolist() == [0, 1]
+    for value in (*observations.values(), *returned, extras["final_ids"], *final.values()):
         assert is_marked(value)
     env.reset(env_ids=torch.tensor([1]))
     env.load_state_dict(env.state_dict())
