@@ -289,6 +289,23 @@ def test_trajectories_random_numbers_and_what_resets_read_do_not_depend_on_the_s
     assert all(map(torch.equal, *results))
 
 
+def test_steps_may_come_with_and_without_inference_mode(make):
+    class Last(Sum):
+        def __call__(self, env: Any) -> torch.Tensor:
+            # Kept, made under whatever mode there is, unless the episode has just begun.
+            if (env.episode_length_buf == 0).any():
+                self.total = env.sim.data.qpos.clone()
+            return self.total
+
+    def add(cfg: ManagerBasedRlEnvCfg) -> None:
+        cfg.observations["actor"].terms["last"] = ObservationTermCfg(func=Last)
+
+    env = make(remember, disturb, look_down, add)
+    for step in range(STEPS):
+        with torch.inference_mode(step % 2 == 0):
+            env.step(torch.zeros(NUM_ENVS, 1))
+
+
 def test_nothing_more_runs_in_steps_without_a_time_out(make, monkeypatch):
     env = make(go_on)
     monkeypatch.setattr(env.sim, "looking_ahead", None)

@@ -101,6 +101,24 @@ def test_surfaces_are_met_from_the_sides_from_which_they_are_there(shapes):
         assert normals[1, i].norm().item() == pytest.approx(float(expected is not None)), name
 
 
+def test_rays_of_some_environments_meet_what_they_meet_among_all(shapes):
+    origins, directions = rays(
+        *[((x + 0.01, 0.02, z), direction) for x, z, direction, _, _ in CASES.values()],
+        ((0.0, 50.0, 3.0), DOWN),
+    )
+    # The ball of the second environment is elsewhere.
+    shapes.data.qpos[1, 2] = 1.0
+    shapes.forward()
+    everywhere = shapes.raycast(origins, directions)
+    some = shapes.raycast(origins, directions, env_ids=torch.tensor([1]))
+    shapes.data.qpos[1, 2] = 0.0
+    shapes.forward()
+    assert everywhere[0][0, -1] != everywhere[0][1, -1]
+    for values, expected in zip(some, everywhere, strict=True):
+        assert values.shape == expected.shape
+        assert torch.equal(values[1], expected[1])
+
+
 def test_flat_ground_of_a_height_field_is_not_taken_for_its_base(shapes):
     origins, directions = rays(((71.99, 1.99, 3.0), DOWN), ((71.99, 1.99, 0.01), DOWN))
     distances, normals, _ = shapes.raycast(origins, directions)

@@ -443,7 +443,7 @@ class ManagerBasedRlEnv:
         with self.sim.looking_ahead(ids):
             if moved is not None and len(placed := ids[moved[ids]]) > 0:
                 self.sim.forward(placed)
-            self.sim.sense()
+            self.sim.sense(ids)
             observations = self.observation_manager.preview()
         self.extras["final_observations"] = {
             name: value[ids]

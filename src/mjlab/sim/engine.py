@@ -106,6 +106,8 @@ class RayQuery:
     """(R,) int32 body whose own geoms are ignored, -1 for none."""
     max_distances: torch.Tensor | None = None
     """(R,), in m; what is farther away is a miss. None for no limit."""
+    env_ids: torch.Tensor | None = None
+    """Environments (n,) int64 whose results are needed; those of others may be misses. None: all."""
 
 
 RayHits = tuple[torch.Tensor, torch.Tensor, torch.Tensor]

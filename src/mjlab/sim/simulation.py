@@ -7,7 +7,7 @@ import copy
 import logging
 import math
 from collections.abc import Callable, Generator
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import mujoco
@@ -415,10 +415,15 @@ class Simulation:
         for callback in self._forward_callbacks:
             callback(stage)
 
-    def sense(self) -> None:
-        """Evaluate camera and ray sensors at the current poses; nothing without such sensors."""
+    def sense(self, env_ids: torch.Tensor | None = None) -> None:
+        """Evaluate camera and ray sensors at the current poses; nothing without such sensors.
+
+        Args:
+            env_ids: Environments (n,) int64 that need results; others may get misses. None: all.
+        """
         if self._sensor_context is not None:
-            self._sensor_context.sense(self.raycast, self.render)
+            raycast = self.raycast if env_ids is None else partial(self.raycast, env_ids=env_ids)
+            self._sensor_context.sense(raycast, self.render)
 
     def set_sensor_context(self, ctx: Any) -> None:
         """Set the object whose `sense(raycast, render)` evaluates camera and ray sensors.
@@ -451,15 +456,17 @@ class Simulation:
         geom_groups: tuple[int, ...] | None = None,
         exclude_body_ids: torch.Tensor | None = None,
         max_distances: torch.Tensor | None = None,
+        env_ids: torch.Tensor | None = None,
     ) -> RayHits:
         """Cast rays: (N, R, 3) world origins and unit directions.
 
         Returns distances (N, R) with -1 on a miss, normals (N, R, 3) with 0, geom ids (N, R) with
         -1. Only geoms of `geom_groups` (None: all) are hit; `exclude_body_ids` (R,) names a body
         per ray whose own geoms are not (-1: none); what is farther than `max_distances` (R,) is a
-        miss. Planes are hit from above only, meshes and height fields from outside only.
+        miss. Planes are hit from above only, meshes and height fields from outside only. Results of
+        environments that are not in `env_ids` (n,), if given, may be misses.
         """
-        query = RayQuery(origins, directions, geom_groups, exclude_body_ids, max_distances)
+        query = RayQuery(origins, directions, geom_groups, exclude_body_ids, max_distances, env_ids)
         return self._engine.raycast(query)
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:

@@ -223,7 +223,9 @@ def _restored_tensor(current: Any, saved: torch.Tensor) -> Any:
     if not isinstance(current, torch.Tensor):
         return saved.clone()
     same = current.shape == saved.shape and current.dtype == saved.dtype
-    if not same or current.requires_grad or not _owns_its_values(current):
+    # An inference tensor cannot be written outside `inference_mode`.
+    is_locked = current.is_inference() and not torch.is_inference_mode_enabled()
+    if not same or is_locked or current.requires_grad or not _owns_its_values(current):
         return saved.to(current.device)
     current.copy_(saved)
     return current

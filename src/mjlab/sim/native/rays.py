@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -66,6 +66,18 @@ class NativeRays:
 
     def cast(self, query: RayQuery) -> RayHits:
         """Cast rays; see `Engine.raycast`."""
+        if query.env_ids is None:
+            hits = self._hits(query, None)
+        else:
+            ids = query.env_ids
+            rows = replace(query, origins=query.origins[ids], directions=query.directions[ids])
+            hits = Hits.misses(*query.origins.shape[:2])
+            hits[ids.numpy()] = self._hits(rows, ids.numpy())
+        distances, normals = torch.from_numpy(hits.distances), torch.from_numpy(hits.normals)
+        return distances, normals, torch.from_numpy(hits.geoms)
+
+    def _hits(self, query: RayQuery, env_ids: Array | None) -> Hits:
+        """Cast rays of which row i is of environment `env_ids[i]`; None: i."""
         directions, table, has_others = query.directions.numpy(), None, True
         # Rows are compared with rows: a last dimension of three takes ten times as long.
         if (directions == np.tile(-_UP, (directions.shape[1], 1))).all():
@@ -75,15 +87,14 @@ class NativeRays:
                 self._tables[key] = self._ground(query.geom_groups, excluded)
             table, has_others = self._tables[key]
         if table is None or not table.is_current(self._engine.model_fields):
-            hits = self._cast_in_batch(query, static=True)
+            hits = self._cast_in_batch(query, env_ids, static=True)
         else:
             hits = table.cast(query.origins.numpy())
             if has_others:
-                hits.take_nearer(self._cast_in_batch(query, static=False))
+                hits.take_nearer(self._cast_in_batch(query, env_ids, static=False))
         if query.max_distances is not None:
             hits.forget(hits.distances > query.max_distances.numpy())
-        distances, normals = torch.from_numpy(hits.distances), torch.from_numpy(hits.normals)
-        return distances, normals, torch.from_numpy(hits.geoms)
+        return hits
 
     def _ground(
         self, groups: tuple[int, ...] | None, excluded: Array
@@ -114,13 +125,14 @@ class NativeRays:
             return None, True
         return GroundTable(model, ground, self._pos[ground], static), others
 
-    def _cast_in_batch(self, query: RayQuery, static: bool) -> Hits:
+    def _cast_in_batch(self, query: RayQuery, env_ids: Array | None, static: bool) -> Hits:
         """Cast against the geoms of the model, those that never move only if `static`."""
         origins, directions = query.origins.numpy(), query.directions.numpy()
         pos, mat = (np.broadcast_to(x, (len(origins), *x.shape)) for x in (self._pos, self._mat))
         if self._fields_are_carried:
             field = self._engine.data_field
-            pos, mat = field("geom_xpos").numpy(), field("geom_xmat").numpy()
+            rows = slice(None) if env_ids is None else env_ids
+            pos, mat = field("geom_xpos").numpy()[rows], field("geom_xmat").numpy()[rows]
 
         def passed(rows: Array, origins: Array, directions: Array, hits: Hits) -> Array:
             return self._rule.passed(origins, directions, hits, hits.geoms, rows, pos, mat)
@@ -130,6 +142,7 @@ class NativeRays:
             origins,
             directions,
             passed if self._rule.is_needed else None,
+            env_ids,
             geomgroup=_group_mask(query.geom_groups),
             bodyexclude=_excluded(query),
             flg_static=static,
@@ -180,20 +193,27 @@ class Hits:
 
 
 def cast_through(
-    batch: Batch, origins: Array, directions: Array, passed: Passed | None, **options: Any
+    batch: Batch,
+    origins: Array,
+    directions: Array,
+    passed: Passed | None,
+    env_ids: Array | None = None,
+    **options: Any,
 ) -> Hits:
-    """Cast rays in the first n simulations, through surfaces that do not count.
+    """Cast rays in n simulations, through surfaces that do not count.
 
     Rays of simulations in which MuJoCo raises are misses.
 
     Args:
-        batch: Simulations, one a row.
+        batch: Simulations.
         origins: (n, R, 3). directions: (n, R, 3).
         passed: Predicate of hits to ignore; None to ignore none.
+        env_ids: Simulations (n,) of the rows; None for the first n.
         options: Further arguments of `Batch.ray`.
     """
     rows = np.arange(len(origins))
-    hits = found = _cast(batch, rows, origins, directions, options)
+    ids = rows if env_ids is None else env_ids
+    hits = found = _cast(batch, ids, origins, directions, options)
     if passed is None:
         return hits
     gone = np.zeros_like(hits.distances)
@@ -210,7 +230,7 @@ def cast_through(
             behind = _BEHIND + _BEHIND_RELATIVE * np.abs(origins).max(axis=-1)
             step = np.where(repeat, found.distances + behind, 0.0).astype(np.float32)
             origins, gone = origins + step[..., None] * directions, gone + step
-            found = _cast(batch, rows, origins, directions, options)
+            found = _cast(batch, ids[rows], origins, directions, options)
         hits[rows] = found
         hits.distances[rows] += np.where(found.distances >= 0.0, gone, 0.0)
     return hits
