@@ -127,6 +127,9 @@ class RslRlSacAlgorithmCfg:
     """Smallest and largest weight of the entropy."""
     target_std: float = 0.15
     """Deviation of each action, before tanh, to whose entropy that of the policy is held."""
+    mean_penalty: float = 0.01
+    """Weight of the squared mean of each action, before tanh, in the loss of the policy. Keeps actions
+    that matter little from drifting to their bounds."""
     noise_hold: int = 1
     """Most steps for which an environment keeps its exploration noise; 1 draws it at every step."""
     symmetry_cfg: dict[str, Any] | None = None

@@ -67,6 +67,7 @@ class SAC:
         alpha_range: tuple[float, float],
         target_std: float,
         pessimistic: bool,
+        mean_penalty: float,
         noise_hold: int,
         scales_rewards: bool,
         mirror: Any = None,
@@ -87,7 +88,7 @@ class SAC:
         self.gamma, self._num_steps_return, self._tau = gamma, num_steps_return, tau
         self._batch_size, self._num_updates = batch_size, num_updates
         self._policy_delay, self._learning_starts = policy_delay, learning_starts
-        self._pessimistic = pessimistic
+        self._pessimistic, self._mean_penalty = pessimistic, mean_penalty
         self._log_alpha = nn.Parameter(torch.tensor(math.log(init_alpha), device=device))
         self._log_alpha_range = (math.log(alpha_range[0]), math.log(alpha_range[1]))
         num_actions = _of(actor).output_dim
@@ -269,7 +270,11 @@ class SAC:
             values = self.critic.values(inputs["critic"], actions)
         value = values.amin(dim=0) if self._pessimistic else values.mean(dim=0)
         loss = (self._log_alpha.exp().detach() * log_prob - value).mean()
-        entropy = _of(self.actor).entropy.detach().mean()
+        distribution = _of(self.actor)
+        # Of actions that are seldom tried, critics know least. Without this, those of joints that
+        # matter little drift to their bounds, where tanh has no gradient that would lead back.
+        loss = loss + self._mean_penalty * distribution.params[0].square().sum(dim=-1).mean()
+        entropy = distribution.entropy.detach().mean()
         alpha_loss = self._log_alpha.exp() * (entropy - self._target_entropy)
         # Not for the critic, whose gradients are those of its own loss.
         loss.backward(inputs=list(self.actor.parameters()))
