@@ -212,6 +212,8 @@ class TestCheckpoints:
 
     def test_files_are_sorted_by_number_and_labelled_with_their_age(self, folder) -> None:
         os.utime(folder / "model_50.pt", (time.time() - 300, time.time() - 300))
+        # Of runs that learn from a replay.
+        (folder / "replay_model_1000.pt").touch()
         source = local_checkpoints(folder, lambda path: push())
         listed = source.fetch_available()
         assert [name for name, _ in listed] == ["model_0.pt", "model_50.pt", "model_1000.pt"]

@@ -44,10 +44,12 @@ class CheckpointManager:
 def local_checkpoints(
     folder: Path, load_policy: Callable[[Path], PolicyProtocol], current: str = ""
 ) -> CheckpointManager:
-    """Return a manager of the `*.pt` files in `folder`; `current` is the one in use."""
+    """Return a manager of the checkpoints (`*.pt`) in `folder`; `current` is the one in use."""
 
     def fetch_available() -> list[tuple[str, str]]:
-        files = sorted(folder.glob("*.pt"), key=lambda path: checkpoint_number(path.name))
+        # The replay beside a checkpoint has no policy.
+        files = [path for path in folder.glob("*.pt") if not path.name.startswith("replay_")]
+        files.sort(key=lambda path: checkpoint_number(path.name))
         now = time.time()
         return [(file.name, format_time_ago(int(now - file.stat().st_mtime))) for file in files]
 
