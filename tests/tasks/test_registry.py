@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import pytest
 
 import mjlab.tasks
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl import MjlabOnPolicyRunner, RslRlOnPolicyRunnerCfg
+from mjlab.rl.config import RslRlOffPolicyRunnerCfg
+from mjlab.rl.learners import with_learner
 from mjlab.scene import SceneCfg
 from mjlab.scripts.cli import run_command
 from mjlab.tasks import registry
@@ -124,13 +129,57 @@ def test_a_profile_that_is_not_there_is_told_with_those_that_are():
 
 @pytest.mark.parametrize(
     ("profile", "message"),
-    [(renamed, "experiment_name .* has to stay 'exp1'"), (lambda env, rl: env, "return nothing")],
+    [
+        (renamed, "experiment_name .* has to stay 'exp1'"),
+        (lambda env, rl: env, "expected None or an RslRlBaseRunnerCfg .* got a ManagerBasedRl"),
+        (lambda env, rl: replace(rl, experiment_name="elsewhere"), "has to stay 'exp1'"),
+    ],
 )
 def test_a_profile_that_does_other_than_editing_is_refused(profile, message):
     rl = RslRlOnPolicyRunnerCfg()
     register_mjlab_task("Test", env_cfg(), rl_cfg=rl, profiles={"cpu": profile})
-    with pytest.raises(ValueError, match=f"'cpu' of task 'Test' .*{message}"):
+    with pytest.raises(ValueError, match=f"'cpu' of task 'Test'.*{message}"):
         load_env_cfg("Test", profile="cpu")
+
+
+def to_sac(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg):
+    env_cfg.decimation += 5
+    sac = with_learner(rl_cfg, "sac")
+    sac.num_steps_per_env = 2
+    sac.evaluation.num_episodes = 7
+    return sac
+
+
+def test_a_profile_may_return_the_config_of_another_learner():
+    rl = RslRlOnPolicyRunnerCfg(seed=3)
+    register_mjlab_task("Test", env_cfg(), rl_cfg=rl, profiles={"cpu": to_sac})
+    assert load_env_cfg("Test", profile="cpu").decimation == 6
+    sac = load_rl_cfg("Test", profile="cpu")
+    assert isinstance(sac, RslRlOffPolicyRunnerCfg)
+    assert (sac.seed, sac.num_steps_per_env) == (3, 2)
+    assert load_rl_cfg("Test", profile="cpu", learner="sac") == sac
+    # PPO as the task has it, for the task as the profile has it.
+    ppo = load_rl_cfg("Test", profile="cpu", learner="ppo")
+    assert ppo == replace(rl, evaluation=sac.evaluation)
+
+
+CONSTANT = RslRlOffPolicyRunnerCfg()
+
+
+def test_what_a_profile_returns_is_copied():
+    profiles: dict = {"cpu": lambda env, rl: CONSTANT}
+    register_mjlab_task("Test", env_cfg(), rl_cfg=RslRlOnPolicyRunnerCfg(), profiles=profiles)
+    load_rl_cfg("Test", profile="cpu").seed = 99
+    assert RslRlOffPolicyRunnerCfg() == CONSTANT
+
+
+def test_a_learner_is_chosen_by_name():
+    register_mjlab_task("Test", env_cfg(), rl_cfg=RslRlOnPolicyRunnerCfg())
+    assert load_rl_cfg("Test", learner="ppo") == load_rl_cfg("Test")
+    assert load_rl_cfg("Test", learner="sac") == RslRlOffPolicyRunnerCfg()
+    unknown: Any = "td3"
+    with pytest.raises(ValueError, match=r"'td3'\. Available: ppo, sac\."):
+        load_rl_cfg("Test", learner=unknown)
 
 
 @pytest.mark.parametrize("name", ["", "two words", "None", "--cpu="])

@@ -230,7 +230,8 @@ class RslRlBaseRunnerCfg:
     load_checkpoint: str = "model_.*.pt"
     """Checkpoint to resume from: a regular expression, of which the newest match is taken."""
     clip_actions: float | None = None
-    """Actions are clipped to plus and minus this before they reach the environment."""
+    """Actions are clipped to plus and minus this before they reach the environment. Those of SAC are
+    in (-1, 1) anyway: the scale of the action term sets how far they reach."""
     upload_model: bool = True
     """Whether checkpoints and exported policies are uploaded to Weights & Biases."""
     evaluation: EvaluationCfg = field(default_factory=EvaluationCfg, kw_only=True)

@@ -8,8 +8,10 @@ from typing import Any
 import torch
 
 from mjlab.rl.rsl import CNN, CNNModel, MLPModel, TensorDict, resolve_callable
+from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
 
 _MODELS = ("actor", "critic", "student", "teacher")
+_SAC_MODELS = {"actor": SacActorModel, "critic": TwinCriticModel}
 # Keys of a CNN config that are not for rsl_rl's CNN.
 _SPATIAL_SOFTMAX_KEYS = ("spatial_softmax", "spatial_softmax_temperature")
 _EXAMPLE = (
@@ -29,6 +31,8 @@ def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
     Raises:
         ValueError: naming the network and the group of observations, and what to do.
     """
+    if "replay_steps" in cfg["algorithm"]:
+        _check_sac_models(observations, cfg)
     shared = bool(cfg["algorithm"].get("share_cnn_encoders"))
     images = {}
     for model in _MODELS:
@@ -36,6 +40,25 @@ def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
             images[model] = _check_model(observations, cfg, model, shared)
     if shared:
         _check_sharing(images)
+
+
+def _check_sac_models(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
+    for model, needed in _SAC_MODELS.items():
+        name = cfg[model]["class_name"]
+        kind = resolve_callable(name)
+        if not (isinstance(kind, type) and issubclass(kind, needed)):
+            raise ValueError(
+                f"agent.{model} class_name: expected {needed.__module__}:{needed.__name__} or a "
+                f"subclass for the learner 'sac', got {name!r}; leave it out, or use --learner ppo."
+            )
+        for group in (cfg.get("obs_groups") or {}).get(model, (model,)):
+            value = observations.get(group, None)
+            if isinstance(value, torch.Tensor) and value.ndim == 4:
+                raise ValueError(
+                    f"agent.obs_groups[{model!r}]: expected flat observations for the learner "
+                    f"'sac', got {group!r}, which holds images of shape {tuple(value.shape[1:])}; "
+                    "use --learner ppo."
+                )
 
 
 def _check_model(

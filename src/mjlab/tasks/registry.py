@@ -27,7 +27,11 @@ from mjlab.compat import older_names
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
     from mjlab.rl.config import RslRlBaseRunnerCfg
+    from mjlab.rl.learners import Learner
     from mjlab.tasks.options import TaskOptions
+
+    # Edits both configs in place; may return the learner's config that replaces the given one.
+    Profile = Callable[[Any, Any], RslRlBaseRunnerCfg | None]
 
 logger = logging.getLogger(__name__)
 
@@ -71,7 +75,7 @@ def register_mjlab_task(
     play_env_cfg: ManagerBasedRlEnvCfg | Callable[..., ManagerBasedRlEnvCfg] | str | None = None,
     rl_cfg: RslRlBaseRunnerCfg | Callable[[], RslRlBaseRunnerCfg] | str | None = None,
     runner_cls: type | str | None = None,
-    profiles: Mapping[str, Callable[[Any, Any], None] | str] | None = None,
+    profiles: Mapping[str, Profile | str] | None = None,
     options: type[TaskOptions] | str | None = None,
 ) -> None:
     """Register a task under `task_id`.
@@ -85,10 +89,11 @@ def register_mjlab_task(
         rl_cfg: the config of the learner, likewise.
         runner_cls: the runner class or its name as `module:Class`; None takes the default.
         profiles: named settings for other circumstances, such as `cpu` for learning on a few
-            cores: for each name a function `(env_cfg, rl_cfg) -> None`, or its name as
-            `module:function`, that edits copies of the task's configs in place. Flags of the
-            command line come after it and win. It may not change `rl_cfg.experiment_name`, by
-            which runs of the task are found.
+            cores: for each name a function `(env_cfg, rl_cfg)`, or its name as
+            `module:function`, that edits copies of the task's configs in place. It may return
+            another learner's config in place of `rl_cfg`, such as `with_learner(rl_cfg, "sac")`
+            of `mjlab.rl.learners`. Flags of the command line come after it and win. It may not
+            change `rl_cfg.experiment_name`, by which runs of the task are found.
         options: a dataclass of further command-line flags, which also gets what the task needs
             before it is built (see `mjlab.tasks.options`), or its name as `module:Class`.
 
@@ -143,38 +148,69 @@ def load_env_cfg(
     return _made(task_name, task.env_cfg, play=True)
 
 
-def load_rl_cfg(task_name: str, profile: str | None = None) -> RslRlBaseRunnerCfg:
-    """Return a copy of the learner's config of a task; raises as `load_env_cfg` does."""
-    if profile is not None:
-        return _with_profile(task_name, profile, play=False)[1]
-    return _made(task_name, _find(task_name).rl_cfg)
+def load_rl_cfg(
+    task_name: str, profile: str | None = None, learner: Learner | None = None
+) -> RslRlBaseRunnerCfg:
+    """Return a copy of the learner's config of a task.
+
+    Args:
+        task_name: Name of the task.
+        profile: One of the task's profiles, which is applied to it; None applies none.
+        learner: `ppo` or `sac`; None takes what the task, or the profile, chooses. If the profile
+            replaces the task's own config, and that is of `learner`, it is taken, with what the
+            profile says of the task. Otherwise it is made by `mjlab.rl.learners.with_learner`.
+
+    Raises:
+        UnknownTaskError, UnknownProfileError, TaskImportError: see `load_env_cfg`.
+        ValueError: the learner is unknown, or cannot have the observations that the task's has.
+    """
+    from mjlab.rl.learners import check_learner, for_task_of, learner_of, with_learner
+
+    if learner is not None:
+        check_learner(learner)
+    if profile is None:
+        cfg = given = _made(task_name, _find(task_name).rl_cfg)
+    else:
+        _, cfg, given = _with_profile(task_name, profile, play=False)
+    if learner is None or learner_of(cfg) == learner:
+        return cfg
+    if learner_of(given) == learner:
+        return for_task_of(given, cfg)
+    return with_learner(cfg, learner)
 
 
 def _with_profile(
     task_name: str, profile: str, play: bool
-) -> tuple[ManagerBasedRlEnvCfg, RslRlBaseRunnerCfg]:
-    """Return copies of both configs of a task as `profile` makes them."""
+) -> tuple[ManagerBasedRlEnvCfg, RslRlBaseRunnerCfg, RslRlBaseRunnerCfg]:
+    """Return copies of both configs of a task as `profile` makes them.
+
+    The third is the learner's config that the profile was given, which it may have replaced.
+    """
+    from mjlab.rl.config import RslRlBaseRunnerCfg
+
     edit = require_profile(task_name, profile)
     if isinstance(edit, str):
         edit = _imported(task_name, edit)
-    env_cfg, rl_cfg = load_env_cfg(task_name, play), load_rl_cfg(task_name)
-    experiment = rl_cfg.experiment_name
-    returned = edit(env_cfg, rl_cfg)
+    env_cfg, given = load_env_cfg(task_name, play), load_rl_cfg(task_name)
+    experiment = given.experiment_name
+    returned = edit(env_cfg, given)
+    rl_cfg = given if returned is None else returned
     named = f"The profile {profile!r} of task {task_name!r}"
-    if returned is not None:
+    if not isinstance(rl_cfg, RslRlBaseRunnerCfg):
         raise ValueError(
-            f"{named} returns a {type(returned).__name__}; it has to edit the two configs that it "
-            "is given, and return nothing."
+            f"{named}: expected None or an RslRlBaseRunnerCfg to be returned, got a "
+            f"{type(rl_cfg).__name__}; edit the two configs that it is given."
         )
     if rl_cfg.experiment_name != experiment:
         raise ValueError(
             f"{named} sets experiment_name to {rl_cfg.experiment_name!r}; it has to stay "
             f"{experiment!r}, because that is where runs of the task are looked for."
         )
-    return env_cfg, rl_cfg
+    # A profile may return a module's constant.
+    return env_cfg, rl_cfg if rl_cfg is given else copy.deepcopy(rl_cfg), given
 
 
-def require_profile(task_name: str, profile: str) -> Callable[[Any, Any], None] | str:
+def require_profile(task_name: str, profile: str) -> Profile | str:
     """Return what a profile was registered with.
 
     Raises:

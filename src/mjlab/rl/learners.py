@@ -1,0 +1,88 @@
+"""Learners by name, and the config of one made from the config of another."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import asdict, fields
+from typing import Any, Literal, get_args
+
+from mjlab.rl.config import (
+    RslRlBaseRunnerCfg,
+    RslRlOffPolicyRunnerCfg,
+    RslRlOnPolicyRunnerCfg,
+)
+
+Learner = Literal["ppo", "sac"]
+LEARNERS: tuple[Learner, ...] = get_args(Learner)
+
+_MIRROR_FUNCTION = "data_augmentation_func"
+# Fields of a run whose values suit one learner only.
+_PACE = frozenset(("num_steps_per_env", "max_iterations", "save_interval"))
+
+
+def check_learner(name: str) -> None:
+    """Raise ValueError, listing the learners, unless `name` is one."""
+    if name not in LEARNERS:
+        raise ValueError(f"Unknown learner {name!r}. Available: {', '.join(LEARNERS)}.")
+
+
+def learner_of(cfg: RslRlBaseRunnerCfg) -> Learner:
+    """Return the learner of a config: `sac` if it is off-policy, else `ppo`."""
+    return "sac" if isinstance(cfg, RslRlOffPolicyRunnerCfg) else "ppo"
+
+
+def with_learner(cfg: RslRlBaseRunnerCfg, learner: Learner) -> RslRlBaseRunnerCfg:
+    """Return `cfg` if it is of `learner`, else a config of `learner` for the same run.
+
+    The fields of `RslRlBaseRunnerCfg` are copied, and the function that makes mirror images.
+    Networks and algorithm have the defaults of the learner.
+
+    Raises:
+        ValueError: the learner is unknown, or is SAC and a network of `cfg` is recurrent or has an
+            image encoder.
+    """
+    check_learner(learner)
+    if learner_of(cfg) == learner:
+        return cfg
+    base = {field.name: getattr(cfg, field.name) for field in fields(RslRlBaseRunnerCfg)}
+    symmetry = getattr(getattr(cfg, "algorithm", None), "symmetry_cfg", None)
+    if learner == "sac":
+        _check_networks_are_plain(cfg)
+        off_policy = RslRlOffPolicyRunnerCfg(**copy.deepcopy(base))
+        if symmetry:
+            off_policy.algorithm.symmetry_cfg = {_MIRROR_FUNCTION: symmetry[_MIRROR_FUNCTION]}
+        return off_policy
+    on_policy = RslRlOnPolicyRunnerCfg(**copy.deepcopy(base))
+    if symmetry:
+        on_policy.algorithm.symmetry_cfg = {**symmetry, "use_data_augmentation": True}
+    return on_policy
+
+
+def for_task_of(cfg: RslRlBaseRunnerCfg, other: RslRlBaseRunnerCfg) -> RslRlBaseRunnerCfg:
+    """Return a copy of `cfg` with what `other` says of the task, such as its evaluation.
+
+    The number of iterations, their length and the interval of checkpoints are those of `cfg`.
+    """
+    cfg = copy.deepcopy(cfg)
+    for field in fields(RslRlBaseRunnerCfg):
+        if field.name not in _PACE:
+            setattr(cfg, field.name, copy.deepcopy(getattr(other, field.name)))
+    return cfg
+
+
+def acting_cfg(cfg: RslRlBaseRunnerCfg) -> dict[str, Any]:
+    """Return `cfg` as the dict of a runner that acts and does not learn: with the least replay."""
+    acting = asdict(cfg)
+    if learner_of(cfg) == "sac":
+        acting["algorithm"]["replay_steps"] = 1
+    return acting
+
+
+def _check_networks_are_plain(cfg: RslRlBaseRunnerCfg) -> None:
+    for name in ("actor", "critic"):
+        for field, kind in (("rnn_type", "a recurrent one"), ("cnn_cfg", "one that sees images")):
+            if getattr(getattr(cfg, name, None), field, None):
+                raise ValueError(
+                    f"agent.{name}: expected a network of flat observations for the learner 'sac', "
+                    f"got {kind} ({field}); use --learner ppo."
+                )
