@@ -69,11 +69,12 @@ def _flags_of() -> dict[str, list[object]]:
     from mjlab.tasks.tracking.options import MotionOptions
 
     train = TrainConfig.from_task("Mjlab-Cartpole-Swingup")
+    sac = TrainConfig.from_task("Mjlab-Cartpole-Swingup", learner="sac")
     play = PlayConfig(env=train.env)
     return {
         # With the flags that motion tracking brings itself.
-        "train": [train, MotionOptions()],
-        "train-seeds": [train, {"seeds": None}],
+        "train": [train, sac, MotionOptions()],
+        "train-seeds": [train, sac, {"seeds": None}],
         "demo": [play],
         "play": [play, MotionOptions()],
         "evaluate": [EvaluateConfig(env=train.env), MotionOptions()],

@@ -49,6 +49,8 @@ CLASSES = [
     "MLPModel",
     "CNNModel",
     "RNNModel",
+    "mjlab.rl.sac_models:SacActorModel",
+    "mjlab.rl.sac_models:TwinCriticModel",
     "mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel",
     REFERENCE_ACTOR,
 ]

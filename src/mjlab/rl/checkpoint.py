@@ -15,9 +15,12 @@ from typing import Any
 
 import torch
 
+from mjlab.rl.learners import Learner
 from mjlab.rl.plain_data import as_plain_data
 
 _TEMPORARY_SUFFIX = ".tmp"
+# Only in checkpoints of SAC.
+_SAC_KEY = "sac_state_dict"
 
 
 class CheckpointError(RuntimeError):
@@ -170,6 +173,15 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
             f"{type(data).__name__}, not a dict."
         )
     return data
+
+
+def learner_of_checkpoint(path: str | os.PathLike[str]) -> Learner:
+    """Return the learner that wrote a checkpoint.
+
+    Raises:
+        CheckpointError: see `load_checkpoint`.
+    """
+    return "sac" if _SAC_KEY in load_checkpoint(path) else "ppo"
 
 
 def _missing_message(path: Path) -> str:

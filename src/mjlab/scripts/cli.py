@@ -171,19 +171,33 @@ def parse_flags(config_type: type[C], default: C, flags: list[str], prog: str) -
     """
     import tyro
 
+    arguments = _arguments(config_type, default, flags, prog)
+    return tyro.cli(config_type, **arguments)
+
+
+def parse_known_flags(
+    config_type: type[C], default: C, flags: list[str], prog: str
+) -> tuple[C, list[str]]:
+    """Return what `parse_flags` does, and the flags that are unknown, which have no effect."""
+    import tyro
+
+    arguments = _arguments(config_type, default, flags, prog)
+    return tyro.cli(config_type, return_unknown_args=True, **arguments)
+
+
+def _arguments(config_type: Any, default: Any, flags: list[str], prog: str) -> dict[str, Any]:
     import mjlab
     from mjlab.scripts.flag_values import flag_rules
     from mjlab.scripts.switch_off import switch_terms_off
 
     edited, flags = switch_terms_off(default, flags)
-    return tyro.cli(
-        config_type,
-        default=edited,
-        args=_with_explicit_switches(config_type, flags),
-        prog=prog,
-        config=mjlab.TYRO_FLAGS,
-        registry=flag_rules(),
-    )
+    return {
+        "default": edited,
+        "args": _with_explicit_switches(config_type, flags),
+        "prog": prog,
+        "config": mjlab.TYRO_FLAGS,
+        "registry": flag_rules(),
+    }
 
 
 def is_given(flag: str, flags: list[str]) -> bool:

@@ -14,7 +14,6 @@ import signal
 import sys
 import threading
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,12 +78,13 @@ def _make_viewer(job: LiveJob, exchange: Exchange, server: viser.ViserServer) ->
 
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.rl import RslRlVecEnvWrapper
+    from mjlab.rl.learners import acting_cfg
     from mjlab.viewer.viser.live import LiveViewer
 
     torch.set_num_threads(1)
     env = ManagerBasedRlEnv(job.env, device="cpu")
     wrapped = RslRlVecEnvWrapper(env, clip_actions=job.agent.clip_actions)
-    runner = job.runner_cls(wrapped, asdict(job.agent), None, "cpu")
+    runner = job.runner_cls(wrapped, acting_cfg(job.agent), None, "cpu")
     network = runner.alg.get_policy()
     weights = NewestWeights(exchange, network, env)
     return LiveViewer(

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.rl.learners import Learner, acting_cfg
 from mjlab.scripts.cli import UserError, tell
-from mjlab.scripts.profiles import parse_with_profile, profile_of_run
+from mjlab.scripts.profiles import parse_with_choices, profile_of_run
 from mjlab.scripts.run_folder import named_checkpoint, newest_checkpoint, read_agent_params
 from mjlab.scripts.task_options import prepare_env_cfg, with_task_options
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
@@ -21,6 +22,8 @@ _CLASSES = (
     "MLPModel",
     "CNNModel",
     "RNNModel",
+    "mjlab.rl.sac_models:SacActorModel",
+    "mjlab.rl.sac_models:TwinCriticModel",
     "mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel",
     "mjlab.tasks.tracking.rl.reference_actor:ReferenceActor",
 )
@@ -73,6 +76,8 @@ class PolicyFlags:
     """Folder of all runs."""
     profile: str | None = None
     """Named settings of the task, such as `cpu`. None: those that the policy was trained with."""
+    learner: Learner | None = None
+    """Learner that the policy is of, to take the newest one of it. None: any."""
     env: ManagerBasedRlEnvCfg | None = None
     """The environment; None takes the task's config."""
 
@@ -96,11 +101,19 @@ def parse_policy_flags(
     Raises:
         UnknownProfileError: the task has no such profile.
     """
-    return parse_with_profile(
-        lambda profile: with_task_options(
-            kind(env=policy_env_cfg(task, profile, purpose=purpose), profile=profile), task
-        ),
-        lambda cfg: profile_of_policy(task, cfg),
+
+    def make_default(profile: str | None = None, learner: str | None = None) -> F:
+        # The learner changes no flags here, so that it is left to the parser.
+        env_cfg = policy_env_cfg(task, profile, purpose=purpose)
+        return with_task_options(kind(env=env_cfg, profile=profile), task)
+
+    def recorded(cfg: F, given: Mapping[str, str | None]) -> dict[str, str | None]:
+        profile = None if "profile" in given else profile_of_policy(task, cfg)
+        return {} if profile is None else {"profile": profile}
+
+    return parse_with_choices(
+        make_default,
+        recorded,
         flags,
         prog=f"{command} {task}",
     )
@@ -144,19 +157,23 @@ def load_policy(
 
         return load_onnx_policy(checkpoint, env, device)
     from mjlab.rl import MjlabOnPolicyRunner
+    from mjlab.rl.checkpoint import learner_of_checkpoint
 
+    agent_cfg = _agent_cfg(task, checkpoint, profile, learner_of_checkpoint(checkpoint))
     runner_cls: Any = load_runner_cls(task) or MjlabOnPolicyRunner
-    runner = runner_cls(env, _agent_cfg(task, checkpoint, profile), None, device)
+    runner = runner_cls(env, agent_cfg, None, device)
     runner.load(str(checkpoint), load_cfg={"actor": True}, strict=True, map_location=device)
     return runner.get_inference_policy(device=device)
 
 
-def _agent_cfg(task: str, checkpoint: Path, profile: str | None = None) -> dict[str, Any]:
+def _agent_cfg(
+    task: str, checkpoint: Path, profile: str | None = None, learner: Learner | None = None
+) -> dict[str, Any]:
     """Return the learner's config of `task`, with the networks that the checkpoint's run had.
 
     The command line may have given them other sizes and classes than the task and its profile do.
     """
-    cfg = asdict(load_rl_cfg(task, profile=profile))
+    cfg = acting_cfg(load_rl_cfg(task, profile=profile, learner=learner))
     saved = read_agent_params(checkpoint.parent)
     for network in ("actor", "critic"):
         settings = saved.get(network)
@@ -174,26 +191,51 @@ def find_checkpoint(task: str, flags: PolicyFlags) -> Path | None:
     None where the flags ask for no trained policy.
 
     Raises:
-        UserError: there is none.
+        UserError: there is none, or another learner than the flags name wrote it.
     """
     if flags.agent != "trained":
         return None
     if flags.checkpoint_file is not None:
-        return named_checkpoint(Path(flags.checkpoint_file), task)
-    experiment = _experiment(task, flags)
-    if flags.wandb_run_path is not None:
+        path = named_checkpoint(Path(flags.checkpoint_file), task)
+    elif flags.wandb_run_path is not None:
         from mjlab.utils.os import get_wandb_checkpoint_path
 
         run = Path(flags.wandb_run_path)
-        return get_wandb_checkpoint_path(experiment, run, flags.wandb_checkpoint_name)[0]
-    path = newest_checkpoint(experiment, task)
+        name = flags.wandb_checkpoint_name
+        path = get_wandb_checkpoint_path(_experiment(task, flags), run, name)[0]
+    else:
+        path = _newest_checkpoint(task, flags)
+    _check_learner(flags, path)
+    return path
+
+
+def _newest_checkpoint(task: str, flags: PolicyFlags) -> Path:
+    experiment = _experiment(task, flags)
+    path = newest_checkpoint(experiment, task, flags.learner)
     if path is None:
+        by, choice = "", ""
+        if flags.learner is not None:
+            by, choice = f" by the learner {flags.learner!r}", f" --learner {flags.learner}"
         raise UserError(
-            f"No checkpoint was named, and {experiment} has none of {task}. Run `train {task}` "
-            "first, or give --checkpoint-file or --wandb-run-path."
+            f"No checkpoint was named, and {experiment} has none of {task}{by}. Run `train "
+            f"{task}{choice}` first, or give --checkpoint-file or --wandb-run-path."
         )
     tell(f"Checkpoint: {path}")
     return path
+
+
+def _check_learner(flags: PolicyFlags, checkpoint: Path) -> None:
+    """Raise UserError if the flags name another learner than the one that wrote `checkpoint`."""
+    if flags.learner is None or checkpoint.suffix == ".onnx":
+        return
+    from mjlab.rl.checkpoint import learner_of_checkpoint
+
+    found = learner_of_checkpoint(checkpoint)
+    if found != flags.learner:
+        raise UserError(
+            f"--learner: expected {found!r}, which wrote {checkpoint}, got {flags.learner!r}; leave "
+            "it out, or name another checkpoint."
+        )
 
 
 def _experiment(task: str, flags: PolicyFlags) -> Path:
@@ -210,7 +252,7 @@ def profile_of_policy(task: str, flags: PolicyFlags) -> str | None:
     if flags.checkpoint_file is None:
         if flags.wandb_run_path is not None:
             return None
-        path = newest_checkpoint(_experiment(task, flags), task)
+        path = newest_checkpoint(_experiment(task, flags), task, flags.learner)
     else:
         try:
             path = named_checkpoint(Path(flags.checkpoint_file), task)

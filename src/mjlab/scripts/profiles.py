@@ -1,66 +1,71 @@
-"""Profiles of tasks on the command line: `--profile cpu`, and the profile that a run was made with.
+"""Choices that decide which other flags there are and what they start from: `--profile`, `--learner`.
 
-A profile changes the defaults that flags start from, so it is looked for before flags are parsed.
+Flags are parsed after them. A command that goes on with a run makes the choices of that run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TypeVar
 
-from mjlab.scripts.cli import parse_flags, tell
+from mjlab.scripts.cli import parse_flags, parse_known_flags, tell
 from mjlab.scripts.run_folder import read_run_info
 from mjlab.tasks.registry import list_profiles
 
 C = TypeVar("C")
 
 CPU_PROFILE = "cpu"
-_FLAG = "--profile"
+_CHOICES = ("profile", "learner")
 
 
-def parse_with_profile(
-    make_default: Callable[[str | None], C],
-    recorded: Callable[[C], str | None],
+def parse_with_choices(
+    make_default: Callable[..., C],
+    recorded: Callable[[C, Mapping[str, str | None]], Mapping[str, str | None]],
     flags: list[str],
     prog: str,
 ) -> C:
-    """Return what `flags` make of the defaults under the profile that they name.
+    """Return what `flags` make of the defaults under the choices that they name.
 
     Args:
-        make_default: Returns the defaults under a profile, or for None without one.
-        recorded: Returns, for what the flags make of the task's own defaults, the profile to use
-            where the flags name none: that of the run at hand.
+        make_default: Returns the defaults under choices, given as keywords; those not given are the
+            task's.
+        recorded: Returns the choices of the run at hand that differ from the task's. Its arguments
+            are what the flags make of the defaults, and the choices that they name, which it need
+            not look for.
         flags: The command line.
         prog: The command, for messages.
 
     Raises:
         UnknownProfileError: the task has no such profile; the message lists those it has.
+        ValueError: the learner is unknown.
     """
-    profile, is_given = asked_profile(flags)
-    default = make_default(profile)
-    cfg = parse_flags(type(default), default, flags, prog)
-    if is_given:
+    given = asked_choices(flags)
+    default = make_default(**given)
+    if len(given) == len(_CHOICES):
+        return parse_flags(type(default), default, flags, prog)
+    # The learner of the run at hand may have flags that the task's has not.
+    cfg, unknown = parse_known_flags(type(default), default, flags, prog)
+    choices = {**recorded(cfg, given), **given}
+    if choices == given and not unknown:
         return cfg
-    profile = recorded(cfg)
-    if profile is None:
-        return cfg
-    default = make_default(profile)
+    default = make_default(**choices)
     return parse_flags(type(default), default, flags, prog)
 
 
-def asked_profile(flags: list[str]) -> tuple[str | None, bool]:
-    """Return the profile that `flags` name, and whether they name one or say `None`."""
-    profile, is_given = None, False
+def asked_choices(flags: list[str]) -> dict[str, str | None]:
+    """Return the choices that `flags` name; None where they say `None`."""
+    choices: dict[str, str | None] = {}
     for position, flag in enumerate(flags):
         name, equals, value = flag.partition("=")
-        if name != _FLAG:
+        name = name.removeprefix("--")
+        if name not in _CHOICES or name == flag:
             continue
         if not equals:
             # Without a value, the parser has a message for it.
             value = flags[position + 1] if position + 1 < len(flags) else "None"
-        profile, is_given = (None if value == "None" else value), True
-    return profile, is_given
+        choices[name] = None if value == "None" else value
+    return choices
 
 
 def profile_of_run(task: str, run_dir: Path) -> str | None:
@@ -81,6 +86,6 @@ def suggest_profile(task: str, profile: str | None, device: str) -> None:
     """Say in one line that there is a profile for training on a CPU, if it is of use here."""
     if profile is None and device == "cpu" and CPU_PROFILE in list_profiles(task):
         tell(
-            f"Training on the CPU: `train {task} {_FLAG} {CPU_PROFILE}` has settings for a "
+            f"Training on the CPU: `train {task} --profile {CPU_PROFILE}` has settings for a "
             "few cores."
         )

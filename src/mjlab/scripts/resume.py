@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjlab.scripts.cli import UserError, tell
 from mjlab.scripts.profiles import profile_of_run
 from mjlab.scripts.run_folder import read_agent_params, read_env_params, read_run_info, run_folders
-from mjlab.tasks.registry import load_env_cfg
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.processes import process_rank
 
 if TYPE_CHECKING:
@@ -21,11 +22,13 @@ if TYPE_CHECKING:
 def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
     """Return the checkpoint that `cfg` asks to go on from, or None if it asks for a new run.
 
-    It is the newest one of the newest run of `task` that the patterns let through. Runs that do
-    not name their task count as runs of any task.
+    It is the newest one of the newest run of `task`, by the learner that `cfg` names, that the
+    patterns let through. Runs that do not name their task count as runs of any task; those that do
+    not name their learner, as runs of any learner.
 
     Raises:
-        UserError: the run asked for is of another task, or a pattern is no regular expression.
+        UserError: the run asked for is of another task or learner, or a pattern is no regular
+            expression.
         ValueError: there is no such run or checkpoint; the message says what there is.
     """
     if not cfg.agent.resume:
@@ -41,31 +44,64 @@ def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
         _check_pattern(f"--agent.{flag.replace('_', '-')}", getattr(agent, flag))
     pattern = agent.load_run
     matching = _matching(experiment, pattern)
-    others = {run.name: found for run in matching if (found := _task_of(run, task)) != task}
+    others = {run.name: why for run in matching if (why := _other_kind(run, task, cfg.learner))}
     if others:
         if len(others) == len(matching):
-            raise UserError(_only_other_tasks(task, agent.load_run, experiment, others))
+            raise UserError(_only_others(task, cfg.learner, agent.load_run, experiment, others))
         own = (re.escape(run.name) for run in matching if run.name not in others)
         pattern = "|".join(own)
     return get_checkpoint_path(experiment, pattern, agent.load_checkpoint)
 
 
-def profile_to_resume(task: str, cfg: TrainConfig) -> str | None:
-    """Return the profile of the run that `cfg` asks to go on from; None if it had none.
+def choices_to_resume(
+    task: str, cfg: TrainConfig, given: Mapping[str, str | None]
+) -> dict[str, str | None]:
+    """Return profile and learner of the run that `cfg` asks to go on from, but for those `given`.
 
-    That of a Weights & Biases run is not known: its files do not say it.
+    The profile is left out if the run had none, and the learner if the task chooses it anyway. Those
+    of a Weights & Biases run are not known before it is fetched.
     """
+    from mjlab.rl.checkpoint import CheckpointError, learner_of_checkpoint
+    from mjlab.rl.learners import learner_of
+
+    choices: dict[str, str | None] = {}
     if cfg.wandb_run_path is not None:
-        return None
+        return choices
     try:
         checkpoint = checkpoint_to_resume(task, cfg)
-    except (UserError, ValueError, OSError):
+        if checkpoint is None:
+            return choices
+        learner = learner_of_checkpoint(checkpoint)
+    except (UserError, ValueError, OSError, CheckpointError):
         # It is told when training is to start, after what else may be wrong with the flags.
-        return None
-    profile = None if checkpoint is None else profile_of_run(task, checkpoint.parent)
-    if profile is not None and _speaks_for_the_run():
-        tell(f"Resuming with the profile {profile!r}, as before; --profile gives another.")
-    return profile
+        return choices
+    if "profile" not in given and (profile := profile_of_run(task, checkpoint.parent)) is not None:
+        choices["profile"] = profile
+        if _speaks_for_the_run():
+            tell(f"Resuming with the profile {profile!r}, as before; --profile gives another.")
+    usual = load_rl_cfg(task, profile=choices.get("profile", cfg.profile))
+    if "learner" not in given and learner != learner_of(usual):
+        choices["learner"] = learner
+        if _speaks_for_the_run():
+            tell(f"Resuming with the learner {learner!r}, as before.")
+    return choices
+
+
+def check_learner_resumes(cfg: TrainConfig, checkpoint: Path) -> None:
+    """Raise UserError unless the learner of `cfg` wrote `checkpoint`.
+
+    Raises:
+        CheckpointError: the checkpoint cannot be read.
+    """
+    from mjlab.rl.checkpoint import learner_of_checkpoint
+    from mjlab.rl.learners import learner_of
+
+    wanted, found = learner_of(cfg.agent), learner_of_checkpoint(checkpoint)
+    if wanted != found:
+        raise UserError(
+            f"--learner: expected {found!r}, which wrote {checkpoint}, got {wanted!r}; use "
+            f"--learner {found}, or choose another run by --agent.load-run."
+        )
 
 
 def _speaks_for_the_run() -> bool:
@@ -153,15 +189,24 @@ def _matching(experiment: Path, pattern: str) -> list[Path]:
     return exact or [run for run in runs if re.match(pattern, run.name)]
 
 
-def _task_of(run_dir: Path, default: str) -> str:
-    return str(read_run_info(run_dir).get("task", default))
+def _other_kind(run_dir: Path, task: str, learner: str | None) -> str | None:
+    """Return in words why a run is not of `task` and `learner`; None if it is, or may be."""
+    info = read_run_info(run_dir)
+    if (found := info.get("task", task)) != task:
+        return f"of {found}"
+    if learner is not None and (found := info.get("learner", learner)) != learner:
+        return f"of the learner {found!r}"
+    return None
 
 
-def _only_other_tasks(task: str, pattern: str, experiment: Path, others: dict[str, str]) -> str:
-    runs = [f"{name} is of {found}" for name, found in list(others.items())[:3]]
+def _only_others(
+    task: str, learner: str | None, pattern: str, experiment: Path, others: dict[str, str]
+) -> str:
+    runs = [f"{name} is {why}" for name, why in list(others.items())[:3]]
     more = f", and {len(others) - 3} more" if len(others) > 3 else ""
     asked = "" if pattern == ".*" else f" that matches --agent.load-run {pattern!r}"
+    asked = f" by the learner {learner!r}{asked}" if learner is not None else asked
     return (
         f"There is no run of {task} in {experiment}{asked}: {', '.join(runs)}{more}. Resume a run "
-        "with the task that it was trained on."
+        "with the task and the learner that it was trained with."
     )

@@ -128,11 +128,15 @@ def _number(checkpoint: Path) -> int:
     return int(checkpoint.stem.removeprefix("model_"))
 
 
-def newest_checkpoint(experiment: Path, task: str) -> Path | None:
-    """Return the last checkpoint of the newest run of `task` that has one."""
+def newest_checkpoint(experiment: Path, task: str, learner: str | None = None) -> Path | None:
+    """Return the last checkpoint of the newest run of `task` that has one; None if there is none.
+
+    `learner` limits it to runs of that learner.
+    """
     for run_dir in run_folders(experiment):
         # Runs that do not name their task were made by other tools, and may be of this one.
-        if read_run_info(run_dir).get("task", task) == task:
+        info = read_run_info(run_dir)
+        if info.get("task", task) == task and learner in (None, info.get("learner", learner)):
             checkpoints = checkpoints_in(run_dir)
             if checkpoints:
                 return checkpoints[-1]

@@ -12,13 +12,14 @@ if TYPE_CHECKING:
 
 _USAGE = task_usage(
     "train",
-    "Train a policy with PPO. Checkpoints, curves and the exported policy go to "
+    "Train a policy, by PPO or, with --learner sac, by SAC. Checkpoints, curves and the exported policy go to "
     "logs/rsl_rl/<experiment>/<time>/.",
     [
         "train Mjlab-Cartpole-Swingup --num-envs 4096",
         "train Mjlab-Cartpole-Swingup --agent.algorithm.learning-rate 3e-4 --agent.seed 1",
         "train Mjlab-Cartpole-Swingup --agent.resume True",
         "train Mjlab-Velocity-Flat-Unitree-Go1 --profile cpu",
+        "train Mjlab-Velocity-Flat-Unitree-Go1 --learner sac --agent.algorithm.batch-size 1024",
     ],
 )
 

@@ -11,7 +11,16 @@ if TYPE_CHECKING:
     from mjlab.scripts.train_run import TrainConfig
 
 _AGENT_COUNTS = ("num_steps_per_env", "max_iterations", "save_interval")
-_ALGORITHM_COUNTS = ("num_learning_epochs", "num_mini_batches")
+_ALGORITHM_COUNTS = (
+    "num_learning_epochs",
+    "num_mini_batches",
+    "batch_size",
+    "num_updates",
+    "replay_steps",
+    "num_steps_return",
+    "policy_delay",
+    "noise_hold",
+)
 _SEPARATORS = ("/", "\\")
 
 
@@ -26,7 +35,7 @@ def _check_numbers(cfg: TrainConfig) -> None:
     agent: Any = cfg.agent
     counts = {f"--agent.{name}": getattr(agent, name) for name in _AGENT_COUNTS}
     for name in _ALGORITHM_COUNTS:
-        # Algorithms other than PPO may lack them.
+        # Each algorithm has some of them.
         counts[f"--agent.algorithm.{name}"] = getattr(getattr(agent, "algorithm", None), name, 1)
     counts |= {"--video-length": cfg.video_length, "--video-interval": cfg.video_interval}
     for flag, value in counts.items():

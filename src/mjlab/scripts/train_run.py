@@ -12,14 +12,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import RslRlBaseRunnerCfg
+from mjlab.rl.learners import Learner, learner_of
 from mjlab.rl.progress import TrainingObserver
 from mjlab.scripts.process_output import ProcessOutput, log_file, output_of
-from mjlab.scripts.profiles import parse_with_profile, suggest_profile
+from mjlab.scripts.profiles import parse_with_choices, suggest_profile
 from mjlab.scripts.resume import (
+    check_learner_resumes,
     checkpoint_to_resume,
+    choices_to_resume,
     is_finished,
     keep_number_of_environments,
-    profile_to_resume,
     seed_to_resume,
 )
 from mjlab.scripts.run_folder import NewRunFolder, SharedRunFolder, write_run_info
@@ -27,7 +29,7 @@ from mjlab.scripts.task_options import options_of, prepare_env_cfg, with_task_op
 from mjlab.scripts.train_checks import check_flags
 from mjlab.scripts.training_device import training_device
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
-from mjlab.utils.processes import ProcessRank, process_rank
+from mjlab.utils.processes import ProcessRank, cores_per_process, process_rank
 
 if TYPE_CHECKING:
     from mjlab.rl import MjlabOnPolicyRunner
@@ -46,6 +48,9 @@ class TrainConfig:
     profile: str | None = None
     """Named settings of the task, such as `cpu`, that all other flags start from; `list-envs` shows
     which there are. None: the task's own, or where a run is resumed, that run's."""
+    learner: Learner | None = None
+    """Learner, which decides what flags there are under --agent.: `ppo`, or `sac`, which learns from a
+    replay (soft actor-critic). None: that of the resumed run, else that of the profile or task."""
     num_envs: int | None = None
     """Number of environments, of each process; short for --env.scene.num-envs."""
     device: str | None = None
@@ -81,12 +86,18 @@ class TrainConfig:
     for each is started. None trains on the CPU."""
 
     @staticmethod
-    def from_task(task: str, profile: str | None = None) -> TrainConfig:
-        """Return the configuration that a task was registered with, under one of its profiles."""
+    def from_task(
+        task: str, profile: str | None = None, learner: Learner | None = None
+    ) -> TrainConfig:
+        """Return the configuration that a task was registered with, under one of its profiles.
+
+        `learner` takes the place of the one that the task or the profile chooses.
+        """
         return TrainConfig(
             env=load_env_cfg(task, profile=profile),
-            agent=load_rl_cfg(task, profile=profile),
+            agent=load_rl_cfg(task, profile=profile, learner=learner),
             profile=profile,
+            learner=learner,
         )
 
 
@@ -95,10 +106,11 @@ def parse_train_flags(task: str, flags: list[str], prog: str) -> TrainConfig:
 
     Raises:
         UnknownProfileError: the task has no such profile.
+        ValueError: the learner is unknown, or is not for this task.
     """
-    return parse_with_profile(
-        lambda profile: with_task_options(TrainConfig.from_task(task, profile), task),
-        lambda cfg: profile_to_resume(task, cfg),
+    return parse_with_choices(
+        lambda **choices: with_task_options(TrainConfig.from_task(task, **choices), task),
+        lambda cfg, given: choices_to_resume(task, cfg, given),
         flags,
         prog,
     )
@@ -138,6 +150,7 @@ def _train(
         cfg.agent.seed = from_first(lambda: _choose_seed(checkpoint))
     _apply_short_forms(cfg, rank)
     if checkpoint is not None:
+        check_learner_resumes(cfg, checkpoint)
         keep_number_of_environments(task, cfg, checkpoint)
     else:
         suggest_profile(task, cfg.profile, device)
@@ -148,6 +161,7 @@ def _train(
             env = _build_env(cfg, device, folder.path, rank)
         try:
             under = f", profile {cfg.profile}" if cfg.profile else ""
+            under += ", learner sac" if learner_of(cfg.agent) == "sac" else ""
             each = "" if rank.is_alone else f" in each of {rank.world_size} processes"
             print(f"Task:    {task}, {env.num_envs} environments{each}{under}")
             print(f"Physics: {env.unwrapped.sim.capabilities.description}", flush=True)
@@ -220,9 +234,10 @@ def _build_env(cfg: TrainConfig, device: str, run_dir: Path, rank: ProcessRank) 
     from mjlab.rl import RslRlVecEnvWrapper
 
     records = cfg.video and rank.is_first
-    env: Any = ManagerBasedRlEnv(
-        cfg.env, device=device, render_mode="rgb_array" if records else None
-    )
+    with _core_for_learner(cfg, device, rank):
+        env: Any = ManagerBasedRlEnv(
+            cfg.env, device=device, render_mode="rgb_array" if records else None
+        )
     if records:
         from mjlab.utils.wrappers import VideoRecorder
 
@@ -236,10 +251,30 @@ def _build_env(cfg: TrainConfig, device: str, run_dir: Path, rank: ProcessRank) 
     return RslRlVecEnvWrapper(env, clip_actions=cfg.agent.clip_actions)
 
 
+@contextlib.contextmanager
+def _core_for_learner(cfg: TrainConfig, device: str, rank: ProcessRank) -> Generator[None]:
+    """Let the physics built within the block leave one core to SAC, which learns at the same time.
+
+    The config is unchanged afterwards, so that evaluations, during which nothing is learned, have all
+    cores.
+    """
+    sim = cfg.env.sim
+    if sim.num_threads != 0 or learner_of(cfg.agent) != "sac":
+        yield
+        return
+    if device == "cpu" and rank.is_alone:
+        sim.num_threads = max(1, min(cores_per_process() - 1, cfg.env.scene.num_envs))
+    try:
+        yield
+    finally:
+        sim.num_threads = 0
+
+
 def _write_params(task: str, cfg: TrainConfig, run_dir: Path) -> None:
     from mjlab.utils.os import dump_yaml
 
-    write_run_info(run_dir, task=task, profile=cfg.profile, command=sys.argv)
+    learner = learner_of(cfg.agent)
+    write_run_info(run_dir, task=task, profile=cfg.profile, learner=learner, command=sys.argv)
     dump_yaml(run_dir / "params" / "env.yaml", asdict(cfg.env))
     dump_yaml(run_dir / "params" / "agent.yaml", asdict(cfg.agent))
 
