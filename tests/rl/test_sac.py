@@ -97,9 +97,8 @@ def test_to_learn_beside_the_physics_changes_no_bit():
     for beside in (True, False):
         torch.manual_seed(3)
         runner = make_runner()
-        assert runner.alg._thread is not None
-        if not beside:
-            runner.alg._thread = None
+        assert runner.alg._beside_physics
+        runner.alg._beside_physics = beside
         runner.learn(5)
         results.append(everything(runner))
     assert_same_bits(*results)

@@ -168,6 +168,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         finally:
             self.logger.stop_logging_writer()
             self._solved_check.close()
+            if (close := getattr(self.alg, "close", None)) is not None:
+                close()
             self._tell("on_end", self.stop_reason)
 
     def _start(self, init_at_random_ep_len: bool) -> TensorDict:

@@ -78,6 +78,11 @@ class SAC:
         multi_gpu_cfg: dict | None = None,
         grad_reduce_bucket_mb: float = 25,
     ) -> None:
+        if mirror is not None and batch_size % 2:
+            raise ValueError(
+                f"SAC batch_size: expected an even number, because half of it are mirror images, got "
+                f"{batch_size}."
+            )
         self.device = device
         self.actor, self.critic = actor.to(device), critic.to(device)
         self._raw_actor, self._raw_critic = self.actor, self.critic
@@ -118,11 +123,11 @@ class SAC:
         # Of updates that are waited for, and of those before.
         self._figures: list[dict[str, torch.Tensor]] = []
         self._finished: list[dict[str, torch.Tensor]] = []
+        self._beside_physics = learns_beside_physics
         self._thread: ThreadPoolExecutor | None = None
         self._running: Future[None] | None = None
         if learns_beside_physics:
-            # A core to itself: more threads would wait for those of the physics.
-            self._thread = ThreadPoolExecutor(1, "learner", lambda: torch.set_num_threads(1))
+            # For the thread that acts. More would wait for those of the physics.
             self.num_threads = 1
 
     # Acting.
@@ -131,6 +136,9 @@ class SAC:
         """Return actions (N, A), with exploration."""
         if not self._started:
             self.storage.start(obs)
+            if self._multi_gpu is not None:
+                # A checkpoint has the state of the first process, and each draws batches of its own.
+                self._generator.manual_seed(int(torch.randint(2**62, ())))
             self._started = True
         distribution = _of(self._policy)
         distribution.update(self._policy.mlp(self._policy.get_latent(obs)))
@@ -156,12 +164,14 @@ class SAC:
             for model in (self.actor, self.critic):
                 model.update_normalization(obs)
             if self._reward_scale is not None:
-                self._reward_scale.update(rewards, dones)
+                self._reward_scale.update(rewards, dones, together=self._multi_gpu is not None)
             _copy_parameters(self.actor, self._policy)
         self._num_steps += 1
         if self._num_steps < self._learning_starts:
             return
-        if self._thread is not None:
+        if self._beside_physics:
+            if self._thread is None:
+                self._thread = ThreadPoolExecutor(1, "learner", lambda: torch.set_num_threads(1))
             self._running = self._thread.submit(self._learn)
             return
         with torch.inference_mode(False), torch.enable_grad():
@@ -185,6 +195,13 @@ class SAC:
             running.result()
         self._finished += self._figures
         self._figures = []
+
+    def close(self) -> None:
+        """Finish learning, and end the thread in which it happens; another step starts one again."""
+        self._wait()
+        if self._thread is not None:
+            self._thread.shutdown()
+            self._thread = None
 
     # Learning.
 
@@ -369,11 +386,9 @@ class SAC:
 
     def broadcast_parameters(self) -> None:
         """Give all processes the weights of the first."""
-        for model in (self.actor, self.critic):
+        for model in (self.actor, self.critic, self._policy, self._target):
             for tensor in model.state_dict().values():
                 torch.distributed.broadcast(tensor, src=0)
-        _copy_parameters(self.actor, self._policy)
-        self._target.load_state_dict(self.critic.state_dict())
 
     def _reduce_gradients(self) -> None:
         assert self._multi_gpu is not None
@@ -463,7 +478,8 @@ class _ReturnScale:
         self._largest = torch.zeros((), device=device)
         self.factor = torch.ones((), device=device)
 
-    def update(self, rewards: torch.Tensor, dones: torch.Tensor) -> None:
+    def update(self, rewards: torch.Tensor, dones: torch.Tensor, together: bool) -> None:
+        """Count a step; `together` with other processes, which then have the same factor."""
         self._returns = rewards + self._gamma * self._returns
         count = self._count + len(rewards)
         shift = self._returns.mean() - self._mean
@@ -473,9 +489,10 @@ class _ReturnScale:
         self._count = count
         self._largest = torch.maximum(self._largest, self._returns.abs().max())
         deviation = (self._sum / count).sqrt()
-        self.factor = 1.0 / torch.maximum(deviation, self._largest / _SCALED_RANGE[1]).clamp(
-            min=1e-6
-        )
+        scale = torch.maximum(deviation, self._largest / _SCALED_RANGE[1]).clamp(min=1e-6)
+        if together:
+            torch.distributed.all_reduce(scale, op=torch.distributed.ReduceOp.MAX)
+        self.factor = 1.0 / scale
         self._returns = torch.where(dones.bool(), 0.0, self._returns)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
