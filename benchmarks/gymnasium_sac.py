@@ -97,7 +97,7 @@ def config(seed: int, num_envs: int, iterations: int) -> RslRlOffPolicyRunnerCfg
     algorithm.gamma, algorithm.tau = 0.99, 0.005
     algorithm.policy_delay, algorithm.pessimistic = 1, True
     algorithm.actor_learning_rate = algorithm.critic_learning_rate = 3e-4
-    algorithm.weight_decay = 0.0
+    algorithm.weight_decay = algorithm.mean_penalty = 0.0
     algorithm.init_alpha, algorithm.alpha_learning_rate = 0.2, 3e-4
     # The usual target of -1 for each action, of squashed actions.
     algorithm.target_std = 0.3
