@@ -215,3 +215,14 @@ def test_returns_beyond_the_range_count_as_its_ends():
 def test_critics_that_tell_nothing_apart_are_refused(changes):
     with pytest.raises(ValueError, match="value_range, num_atoms"):
         critic(**changes)
+
+
+def test_values_keep_their_digits_in_mixed_precision():
+    torch.manual_seed(0)
+    model = critic()
+    with torch.autocast("cpu", torch.bfloat16):
+        logits = model.logits(torch.randn(50, 4), torch.zeros(50, 3))
+        values = model.values(torch.randn(50, 4), torch.zeros(50, 3))
+    assert logits[0].dtype == values.dtype == torch.float32
+    # A number of bfloat16 has 8 bits.
+    assert not torch.equal(values, values.bfloat16().float())

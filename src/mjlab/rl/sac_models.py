@@ -193,8 +193,9 @@ class TwinCriticModel(MLPModel):
 
     def values(self, latent: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """Return the expected return (2, N) that each critic predicts."""
-        logits = torch.stack(self.logits(latent, actions))
-        return torch.softmax(logits, dim=-1) @ self.atoms
+        probabilities = torch.softmax(torch.stack(self.logits(latent, actions)), dim=-1)
+        # Not as a matrix product, which mixed precision would round to three digits.
+        return (probabilities * self.atoms).sum(dim=-1)
 
     def distribution_of(self, returns: torch.Tensor, spread: float = 0.75) -> torch.Tensor:
         """Return probabilities (N, atoms) whose mean is `returns` (N,), for cross-entropy.
