@@ -2,9 +2,9 @@
 
     uv run --with gymnasium python benchmarks/gymnasium_sac.py HalfCheetah-v5 --steps 300000
 
-Published for HalfCheetah (SAC, one environment, an update of 256 transitions for every step): mean
-returns of about 5,000 after 200,000 steps and 10,000 after a million (Haarnoja et al., arXiv
-1812.05905, figure 1); here the same number of updates is made with several environments at once.
+Published for HalfCheetah (SAC, one environment, an update of 256 transitions for every step): a mean
+return of about 10,000 after a million steps (Haarnoja et al., arXiv 1812.05905, figure 1). Here the
+same number of updates is made with several environments at once.
 """
 
 from __future__ import annotations
