@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import torch
+
+from mjlab.utils.lab_api.string import resolve_matching_names_values
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -78,3 +81,36 @@ def single_body(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> int | None
             f"needed, or no body_names for the root {entity.body_names[0]!r}."
         )
     return int(chosen[0])
+
+
+def values_of_joints(
+    joints: list[str],
+    name: str,
+    table: dict[str, float],
+    *,
+    above: float = -math.inf,
+    least: float = -math.inf,
+) -> list[float]:
+    """Return the value of each joint, of the parameter `name`, a table of patterns and values.
+
+    Raises:
+        ValueError: a joint matches no pattern or several, a pattern matches no joint, or a value is
+            not `above` a bound or less than the `least`.
+    """
+    try:
+        _, covered, values = resolve_matching_names_values(table, joints)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+    missing = [joint for joint in joints if joint not in covered]
+    if missing:
+        raise ValueError(
+            f"{name} has no entry for the joints {missing}. Its patterns {list(table)} must cover "
+            "every selected joint."
+        )
+    wrong = {
+        pattern: value for pattern, value in table.items() if not (value > above and value >= least)
+    }
+    if wrong:
+        bound = f"above {above:g}" if above > least else f"of at least {least:g}"
+        raise ValueError(f"{name}: expected numbers {bound}, got {wrong}.")
+    return [float(value) for value in values]

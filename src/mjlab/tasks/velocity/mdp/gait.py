@@ -19,10 +19,9 @@ from mjlab.managers.build_checks import checked_when_built
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.sensor import TerrainHeightSensor
-from mjlab.tasks.velocity.mdp._shared import command_speed
+from mjlab.tasks.velocity.mdp._shared import command_speed, values_of_joints
 from mjlab.tasks.velocity.mdp.sensor_checks import check_height_sensor
 from mjlab.utils.lab_api.math import quat_apply_inverse
-from mjlab.utils.lab_api.string import resolve_matching_names_values
 from mjlab.utils.torch import constant_tensor
 
 if TYPE_CHECKING:
@@ -201,19 +200,7 @@ class weighted_joint_deviation:
         asset: Entity = env.scene[asset_cfg.name]
         # The names are in the order of the joint ids, whichever order the config asks for.
         joints = list(asset_cfg.joint_names or asset.joint_names)
-        try:
-            _, covered, values = resolve_matching_names_values(weights, joints)
-        except ValueError as error:
-            raise ValueError(f"weights: {error}") from error
-        missing = [joint for joint in joints if joint not in covered]
-        if missing:
-            raise ValueError(
-                f"weights: expected a pattern for every selected joint, got none for {missing}; use "
-                "weight 0 for joints that are free."
-            )
-        wrong = {pattern: weight for pattern, weight in weights.items() if not weight >= 0.0}
-        if wrong:
-            raise ValueError(f"weights: expected numbers of at least 0, got {wrong}.")
+        values = values_of_joints(joints, "weights", weights, least=0.0)
         self._weights = torch.tensor(values, dtype=torch.float32, device=env.device)
 
     def __call__(

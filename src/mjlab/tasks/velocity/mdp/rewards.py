@@ -28,6 +28,7 @@ from mjlab.tasks.velocity.mdp._shared import (
     masked_mean,
     single_body,
     tilt_of,
+    values_of_joints,
     velocity_command,
 )
 from mjlab.tasks.velocity.mdp.feet_rewards import feet_air_time as feet_air_time
@@ -38,7 +39,6 @@ from mjlab.tasks.velocity.mdp.feet_rewards import soft_landing as soft_landing
 from mjlab.tasks.velocity.mdp.sensor_checks import check_builtin_sensor
 from mjlab.tasks.velocity.mdp.terrain_utils import terrain_normal_from_sensors
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
-from mjlab.utils.lab_api.string import resolve_matching_names_values
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -262,7 +262,8 @@ class variable_posture:
         joints = list(asset_cfg.joint_names)
         tables = [f"std_{gait}" for gait in ("standing", "walking", "running")]
         stds = torch.tensor(
-            [_std_of(joints, name, params[name]) for name in tables], dtype=torch.float32
+            [values_of_joints(joints, name, params[name], above=0.0) for name in tables],
+            dtype=torch.float32,
         )
         # (3, joints): what squared errors are weighted with, which makes their sum a mean.
         self._weights = (1.0 / (stds.square() * len(joints))).to(env.device)
@@ -285,21 +286,3 @@ class variable_posture:
         speed = command_speed(env, command_name)
         gait = (speed >= walking_threshold).long() + (speed >= running_threshold).long()
         return torch.exp(-(error.square_() * self._weights[gait]).sum(dim=1))
-
-
-def _std_of(joints: list[str], name: str, table: dict[str, float]) -> list[float]:
-    """Return the standard deviation of each joint."""
-    try:
-        _, covered, values = resolve_matching_names_values(table, joints)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
-    missing = [joint for joint in joints if joint not in covered]
-    if missing:
-        raise ValueError(
-            f"{name} has no entry for the joints {missing}. Its patterns {list(table)} must cover "
-            "every selected joint."
-        )
-    wrong = {pattern: std for pattern, std in table.items() if not std > 0.0}
-    if wrong:
-        raise ValueError(f"{name} has {wrong}; standard deviations have to be positive.")
-    return [float(value) for value in values]
