@@ -21,8 +21,7 @@ from mjlab.rl.checkpoint import (
     save_checkpoint,
 )
 from mjlab.rl.migration import migrate
-from mjlab.rl.rng import rng_state, set_rng_state
-from mjlab.utils.random import preserved_rng
+from mjlab.utils.random import preserved_rng, rng_state, set_rng_state
 
 
 def test_data_comes_back_as_saved(tmp_path: Path):

@@ -42,7 +42,7 @@ def make_runner(env_cls: type[FakeEnv] = ObservingEnv, **changes: Any) -> MjlabO
 
 
 class Log:
-    """What passed between environment, critic and storage in `learn(1)`, step by step."""
+    """Record of what environment, critic and storage exchange in each step of `learn(1)`."""
 
     def __init__(self, runner: MjlabOnPolicyRunner) -> None:
         self.steps: list[tuple[torch.Tensor, torch.Tensor, dict[str, Any]]] = []

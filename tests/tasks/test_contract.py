@@ -17,9 +17,9 @@ import yaml
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl.config import RslRlBaseRunnerCfg
-from mjlab.rl.rng import rng_state, set_rng_state
 from mjlab.tasks.registry import list_tasks, load_env_cfg, load_rl_cfg, load_runner_cls
 from mjlab.utils.os import dump_yaml
+from mjlab.utils.random import rng_state, set_rng_state
 
 # Odd, so that no other dimension of a tensor is likely to be the same.
 NUM_ENVS = 7

@@ -136,11 +136,11 @@ class RslRlSacAlgorithmCfg:
     """Learning from mirror images too, as for PPO: `{"data_augmentation_func": "module:function"}`.
     Half of each batch are then mirror images."""
     use_mixed_precision: bool = False
-    """Whether networks compute in bfloat16 while learning. On CPUs that have AVX-512-bf16 or AMX this
-    takes two thirds of the time."""
+    """Mixed precision: bfloat16 in the networks while learning. Two thirds of the time on CPUs with
+    AVX-512-bf16 or AMX."""
     save_replay: bool = True
-    """Whether the replay is written beside the newest checkpoint. Without it, a resumed run learns from
-    new steps only."""
+    """Replay file beside the newest checkpoint. Without it, the replay of a resumed run starts
+    empty."""
     class_name: str = "mjlab.rl.sac:SAC"
     """A class of rsl_rl, or `module:Class`."""
 

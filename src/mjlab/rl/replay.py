@@ -167,7 +167,7 @@ class ReplayStorage:
         # Steps count from the oldest one.
         oldest = self._row - self._num_filled
         first = (oldest + drawn // self._num_envs) % (self._num_steps + 1)
-        row, kind = first, torch.zeros_like(drawn, dtype=torch.int8)
+        kind = torch.zeros_like(drawn, dtype=torch.int8)
         returns = torch.zeros(size, device=self._device)
         discounts = torch.ones(size, device=self._device)
         last = first
@@ -183,20 +183,19 @@ class ReplayStorage:
         overwritten = timed_out & (numbers < self._num_ends_stored - self._num_ends)
         known = ~(overwritten | (kind == _CUT_OFF))
         after = (last + 1) % (self._num_steps + 1)
-        next_observations = {}
+        chosen = timed_out.nonzero().flatten()
+        ends = numbers[chosen] % self._num_ends
+        observations, next_observations = {}, {}
         for name, stored in self._observations.items():
-            value = stored[after, envs]
-            chosen = timed_out.nonzero().flatten()
-            value[chosen] = self._ends[name][numbers[chosen] % self._num_ends]
-            next_observations[name] = value
+            observations[name] = stored[first, envs]
+            next_observations[name] = stored[after, envs]
+            next_observations[name][chosen] = self._ends[name][ends]
         return Batch(
-            observations=self._as_tensordict(
-                {name: stored[first, envs] for name, stored in self._observations.items()}, size
-            ),
+            observations=TensorDict(observations, batch_size=[size]),
             actions=self._actions[first, envs],
             returns=returns,
             discounts=torch.where(kind == _TERMINATED, 0.0, discounts),
-            next_observations=self._as_tensordict(next_observations, size),
+            next_observations=TensorDict(next_observations, batch_size=[size]),
             weights=known.float(),
         )
 
@@ -240,9 +239,6 @@ class ReplayStorage:
             **{f"observations/{name}": value for name, value in self._observations.items()},
             **{f"ends/{name}": value for name, value in self._ends.items()},
         }
-
-    def _as_tensordict(self, groups: dict[str, torch.Tensor], size: int) -> TensorDict:
-        return TensorDict(groups, batch_size=[size])
 
 
 class ReplayFiles:

@@ -33,6 +33,8 @@ from mjlab.rl.sac_models import SacActorModel, SquashedGaussian, TwinCriticModel
 
 # Of returns whose scale is estimated, where no range of values is given.
 _SCALED_RANGE = (-5.0, 5.0)
+# What a checkpoint can be loaded in.
+_PARTS = ("actor", "critic", "optimizer", "iteration")
 
 
 class SAC:
@@ -165,7 +167,7 @@ class SAC:
                 model.update_normalization(obs)
             if self._reward_scale is not None:
                 self._reward_scale.update(rewards, dones, together=self._multi_gpu is not None)
-            _copy_parameters(self.actor, self._policy)
+            self._policy.load_state_dict(self.actor.state_dict())
         self._num_steps += 1
         if self._num_steps < self._learning_starts:
             return
@@ -358,8 +360,7 @@ class SAC:
         """
         self._wait()
         everything = load_cfg is None
-        cfg = dict.fromkeys(("actor", "critic", "optimizer", "iteration"), True)
-        cfg = cfg if load_cfg is None else load_cfg
+        cfg = dict.fromkeys(_PARTS, True) if load_cfg is None else load_cfg
         if cfg.get("actor"):
             for model in (self.actor, self._policy):
                 model.load_state_dict(loaded_dict["actor_state_dict"], strict=strict)
@@ -439,7 +440,7 @@ class _HeldNoise:
     """Standard normal noise (N, A), of which each environment keeps a draw for some steps.
 
     For how many is drawn from a Zipf distribution, P(k) ~ 1 / k^2 up to a largest k (FlashSAC, arXiv
-    2604.04539). Noise of every step anew averages out before a leg has moved.
+    2604.04539). Noise that is redrawn at every step averages out before a leg has moved.
     """
 
     def __init__(self, num_envs: int, num_actions: int, longest: int, device: str) -> None:
@@ -510,12 +511,3 @@ def _of(model: SacActorModel) -> SquashedGaussian:
     distribution = model.distribution
     assert isinstance(distribution, SquashedGaussian)
     return distribution
-
-
-def _copy_parameters(source: nn.Module, to: nn.Module) -> None:
-    """Copy parameters and statistics from one network to another of the same shape."""
-    with torch.no_grad():
-        for own, other in zip(to.parameters(), source.parameters(), strict=True):
-            own.copy_(other)
-        for own, other in zip(to.buffers(), source.buffers(), strict=True):
-            own.copy_(other)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.rl.rng import rng_state, set_rng_state
 from mjlab.rl.rsl import TensorDict
+from mjlab.utils.random import rng_state, set_rng_state
 
 if TYPE_CHECKING:
     from mjlab.rl.rsl import VecEnv

@@ -172,7 +172,7 @@ class GrowingPushes(Easing):
         if self._full is None:
             return None
         part = self.fraction(steps)
-        grown = {axis: (part * low, part * high) for axis, (low, high) in self._full.items()}
+        grown = {axis: _times(tuple(bounds), part) for axis, bounds in self._full.items()}
         self._params(event_name)["velocity_range"] = grown
         return part
 
@@ -269,7 +269,7 @@ class GrowingDifficulty(Easing):
         self._scale_command(command_name, command_from + (1.0 - command_from) * d)
         if self._pushes is not None:
             part = push_from + (1.0 - push_from) * d
-            grown = {axis: (part * low, part * high) for axis, (low, high) in self._pushes.items()}
+            grown = {axis: _times(tuple(bounds), part) for axis, bounds in self._pushes.items()}
             env.event_manager.get_term_cfg(event_name).params["velocity_range"] = grown
         part = noise_from + (1.0 - noise_from) * d
         for noise, sizes in self._noises:
@@ -292,7 +292,7 @@ class GrowingDifficulty(Easing):
         self._episode_start[env_ids] = env.common_step_counter
 
     def _copes(self, reward_name: str, survival: float, tracking: float) -> bool:
-        """Return whether the policy coped in the interval, and start to count anew."""
+        """Return whether the policy coped in the interval, and reset the counters."""
         env = self._env
         survived, fell, reward, steps = self._tally.tolist()
         self._tally.zero_()

@@ -12,6 +12,7 @@ import contextlib
 import os
 import random
 from collections.abc import Generator
+from typing import Any
 
 import numpy as np
 import torch
@@ -54,19 +55,55 @@ def seed_rng(seed: int, torch_deterministic: bool = False) -> None:
         torch.set_deterministic_debug_mode("warn")
 
 
+def rng_state() -> dict[str, Any]:
+    """Return the states of torch (CPU and GPUs), NumPy and Python as tensors and numbers."""
+    kind, keys, position, has_gauss, cached_gaussian = np.random.get_state(legacy=True)
+    if kind != "MT19937":
+        raise ValueError(f"NumPy's global generator is {kind}; only MT19937 can be saved.")
+    version, words, next_gauss = random.getstate()
+    state: dict[str, Any] = {
+        "torch": torch.get_rng_state(),
+        "numpy": {
+            "keys": torch.from_numpy(np.asarray(keys).astype(np.int64)),
+            "position": int(position),
+            "has_gauss": int(has_gauss),
+            "cached_gaussian": float(cached_gaussian),
+        },
+        "python": {
+            "version": version,
+            "words": torch.tensor(words, dtype=torch.int64),
+            "next_gauss": next_gauss,
+        },
+    }
+    if torch.cuda.is_available() and torch.cuda.is_initialized():
+        state["cuda"] = [value.cpu() for value in torch.cuda.get_rng_state_all()]
+    return state
+
+
+def set_rng_state(state: dict[str, Any]) -> None:
+    """Restore what `rng_state` returned. States of GPUs that are not there are left out."""
+    torch.set_rng_state(state["torch"].cpu())
+    saved = state["numpy"]
+    keys = saved["keys"].cpu().numpy().astype(np.uint32)
+    np.random.set_state(
+        ("MT19937", keys, saved["position"], saved["has_gauss"], saved["cached_gaussian"])
+    )
+    saved = state["python"]
+    words = tuple(int(word) for word in saved["words"].tolist())
+    random.setstate((saved["version"], words, saved["next_gauss"]))
+    if "cuda" in state and torch.cuda.is_available():
+        for device, value in enumerate(state["cuda"][: torch.cuda.device_count()]):
+            torch.cuda.set_rng_state(value.cpu(), device)
+
+
 @contextlib.contextmanager
 def preserved_rng() -> Generator[None]:
-    """Put the generators of Python, NumPy and torch back, after the block, to where they were."""
-    python, numpy, cpu = random.getstate(), np.random.get_state(), torch.get_rng_state()
-    gpus = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
+    """Put all generators back, after the block, to where they were before it."""
+    state = rng_state()
     try:
         yield
     finally:
-        random.setstate(python)
-        np.random.set_state(numpy)
-        torch.set_rng_state(cpu)
-        if gpus:
-            torch.cuda.set_rng_state_all(gpus)
+        set_rng_state(state)
 
 
 def process_seed(seed: int, rank: int) -> int:

@@ -7,9 +7,9 @@ import torch
 from velocity_tasks import GO1_FLAT, GO1_ROUGH, task_cfg
 
 from mjlab.envs import ManagerBasedRlEnv
-from mjlab.rl.rng import rng_state, set_rng_state
 from mjlab.tasks.registry import list_tasks
 from mjlab.tasks.velocity import mdp
+from mjlab.utils.random import rng_state, set_rng_state
 
 G1_FLAT = "Mjlab-Velocity-Flat-Unitree-G1"
 
