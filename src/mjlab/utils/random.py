@@ -71,7 +71,7 @@ def rng_state() -> dict[str, Any]:
         },
         "python": {
             "version": version,
-            "words": torch.tensor(words, dtype=torch.int64),
+            "words": torch.from_numpy(np.array(words, dtype=np.int64)),
             "next_gauss": next_gauss,
         },
     }
@@ -89,7 +89,7 @@ def set_rng_state(state: dict[str, Any]) -> None:
         ("MT19937", keys, saved["position"], saved["has_gauss"], saved["cached_gaussian"])
     )
     saved = state["python"]
-    words = tuple(int(word) for word in saved["words"].tolist())
+    words = tuple(saved["words"].tolist())
     random.setstate((saved["version"], words, saved["next_gauss"]))
     if "cuda" in state and torch.cuda.is_available():
         for device, value in enumerate(state["cuda"][: torch.cuda.device_count()]):
