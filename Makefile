@@ -2,7 +2,8 @@
 UV := ./tools/uv
 DEV := $(UV) run --group dev
 
-.PHONY: help train test test-slow test-gpu-script test-mujoco-next check format bench gpu packages docs
+.PHONY: help train test test-slow test-gpu-script test-mujoco-next check format bench reference gpu \
+	packages docs
 
 help:  ## Show this list.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -42,6 +43,12 @@ format:  ## Format the code and fix what lint can fix.
 
 bench:  ## Measure; writes the table to benchmarks/results/. BEFORE=../checkout to compare with.
 	$(DEV) python benchmarks/run.py $(if $(BEFORE),--before $(BEFORE))
+
+# DEVICE has a default below, which is not meant here.
+reference:  ## Train stock tasks on several seeds; TASKS="A B" SEEDS=N MINUTES=N AGAIN=1 DEVICE=cpu limit it.
+	$(DEV) python benchmarks/reference.py $(if $(TASKS),--tasks $(TASKS)) $(if $(SEEDS),--seeds $(SEEDS)) \
+		$(if $(MINUTES),--minutes $(MINUTES)) $(if $(AGAIN),--again) \
+		$(if $(filter command environment,$(origin DEVICE)),--device $(DEVICE))
 
 # No network and no uv: any Python with the dependencies, that of the project where there is one.
 PYTHON ?= $(or $(wildcard .venv/bin/python),python3)

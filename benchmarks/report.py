@@ -51,7 +51,7 @@ def write(rows: list[Row]) -> None:
     machine = {
         "date": datetime.now().strftime("%Y-%m-%d %H:%M"),
         "cores": available_cores(),
-        "processor": _processor(),
+        "processor": processor(),
         "python": platform.python_version(),
         "torch": torch.__version__,
         "mujoco": mujoco.__version__,
@@ -64,7 +64,8 @@ def write(rows: list[Row]) -> None:
     (RESULTS / "table.json").write_text(json.dumps(content, indent=2) + "\n")
 
 
-def _processor() -> str:
+def processor() -> str:
+    """Return the name of the processor."""
     for line in (
         Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else ()
     ):

@@ -201,6 +201,11 @@ def test_the_wheel_carries_its_types(site):
     assert (site / "mjlab" / "py.typed").is_file()
 
 
+def test_the_wheel_carries_the_references_that_verify_reads(site):
+    names = {path.name for path in (ROOT / "src" / "mjlab" / "reference").iterdir()}
+    assert {path.name for path in (site / "mjlab" / "reference").iterdir()} == names
+
+
 def test_a_package_is_type_checked_against_the_wheel(site, tmp_path):
     right = textwrap.dedent(
         """

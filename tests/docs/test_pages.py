@@ -14,14 +14,18 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = sorted((ROOT / "docs").glob("*.md")) + sorted((ROOT / "docs" / "api").glob("*.md"))
+PAGES = [
+    page
+    for folder in (".", "api", "reference")
+    for page in sorted((ROOT / "docs" / folder).glob("*.md"))
+]
 
 _COMMAND = re.compile(r"\buv run (?:--\S+ )*([\w-]+)")
 _FLAG = re.compile(r"(?<![\w-])--([a-z][\w.-]*[a-z])")
 _OBJECT = re.compile(r"^\.\. auto\w+:: (\S+)$", re.MULTILINE)
 _COMMAND_LINE = re.compile(
     r"\b(train-seeds|train|demo|play|evaluate|profile-env|export-scene|viz-nan|visualize_terrain"
-    r"|csv_to_npz)"
+    r"|csv_to_npz|verify)"
     r"((?: [^\s`#]+)*)"
 )
 _MAKE = re.compile(r"\bmake ([a-z-]+)")
@@ -64,6 +68,7 @@ def _flags_of() -> dict[str, list[object]]:
     from mjlab.scripts.play import PlayConfig
     from mjlab.scripts.profile_env import ProfileConfig
     from mjlab.scripts.train import TrainConfig
+    from mjlab.scripts.verify import VerifyConfig
     from mjlab.scripts.visualize_terrain import VisualizeTerrainConfig
     from mjlab.scripts.viz_nan import VizNanConfig
     from mjlab.tasks.tracking.options import MotionOptions
@@ -83,6 +88,7 @@ def _flags_of() -> dict[str, list[object]]:
         "export-scene": [ExportSceneConfig()],
         "visualize_terrain": [VisualizeTerrainConfig()],
         "viz-nan": [VizNanConfig()],
+        "verify": [VerifyConfig()],
     }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import statistics
 from dataclasses import asdict
 from pathlib import Path
@@ -124,6 +125,41 @@ def test_a_resumed_run_evaluates_and_stops_as_the_uninterrupted_one(tmp_path: Pa
     second.learn(100)
     assert before.told + after.told == expected.told
     assert second.current_learning_iteration == whole.current_learning_iteration
+
+
+class Stopping(TrainingObserver):
+    """Stops training, as Ctrl-C does, at an iteration after which an evaluation is due."""
+
+    def __init__(self, iteration: int) -> None:
+        self._iteration = iteration
+
+    def on_iteration(self, stats):
+        if stats.iteration == self._iteration:
+            signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize("remaining", [0, 1, 5])
+def test_an_evaluation_left_out_by_a_stop_is_made_up_for(tmp_path: Path, remaining):
+    """`remaining` iterations before the run is solved; with none, no more is trained."""
+    whole, expected = learner(SEED)
+    whole.learn(100)
+    stopped_at = whole.current_learning_iteration - remaining
+    first, before = learner(SEED, tmp_path / "first")
+    first.observers.append(Stopping(stopped_at))
+    first.learn(100)
+    assert (first.stop_reason, first.current_learning_iteration) == ("interrupted", stopped_at)
+    second, after = learner(SEED, tmp_path / "second")
+    second.load(str(tmp_path / "first" / f"model_{stopped_at - 1}.pt"))
+    second.learn(100)
+    assert before.told + after.told == expected.told
+    assert second.stop_reason == "solved"
+    solved_at = whole.current_learning_iteration
+    assert second.current_learning_iteration == solved_at
+    assert (tmp_path / "second" / f"model_{solved_at - 1}.pt").is_file()
+    # In one process it goes on in the same way.
+    first.observers.pop()
+    first.learn(100)
+    assert before.told == expected.told
 
 
 def test_a_run_that_does_not_stop_is_evaluated_to_the_end_without_confirmations():

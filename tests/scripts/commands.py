@@ -16,8 +16,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
 import torch
 
+from mjlab.rl.progress import IterationStats
+from mjlab.scripts import train_run
 from mjlab.scripts.run_folder import checkpoints_in, read_run_info
 
 TASK = "Mjlab-Cartpole-Swingup"
@@ -81,6 +84,19 @@ def run_script(script: str, *argv: str) -> Outcome:
         sys.argv = before
     assert isinstance(status, int)
     return Outcome(status, out.getvalue(), err.getvalue())
+
+
+@contextlib.contextmanager
+def stopped_after(iterations: int) -> Iterator[None]:
+    """Send SIGINT to this process when a training run in it has had so many iterations."""
+
+    def stop(observer: object, stats: IterationStats) -> None:
+        if stats.iteration == iterations:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train_run._Beginning, "on_iteration", stop)
+        yield
 
 
 def interrupt_training(command: list[str], log_root: Path, patience: float = 60.0) -> str:

@@ -117,6 +117,13 @@ def test_an_error_without_a_text_is_called_by_its_name(failing):
     assert failing(ValueError())[2].startswith("error: ValueError\n")
 
 
+def test_an_error_may_have_another_status(failing):
+    class BadCallError(UserError):
+        exit_status = 2
+
+    assert failing(BadCallError("No."))[0] == 2
+
+
 def test_an_interrupt_ends_with_its_customary_status_and_no_message(failing):
     assert failing(KeyboardInterrupt()) == (130, "", "")
 
@@ -206,7 +213,10 @@ def test_a_device_that_cannot_be_used_is_refused_with_what_to_do(monkeypatch):
         resolve_device("gpu")
 
 
-@pytest.mark.parametrize("arguments", [["list_envs"], ["train", "--help"], ["play", "--help"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [["list_envs"], ["train", "--help"], ["play", "--help"], ["verify", "--help"]],
+)
 def test_what_only_answers_loads_nothing_heavy(arguments):
     code = (
         "import sys\n"

@@ -140,11 +140,13 @@ def test_dropping_leaves_the_curriculum_of_the_task():
     assert set(cfg.curriculum) == {*kept, "nothing"}
 
 
-def test_coarse_physics_keeps_the_time_of_a_step_and_leaves_flags_alone():
+@pytest.mark.parametrize("num_steps", [1, 2, 3])
+def test_coarse_physics_keeps_the_time_of_a_step_and_leaves_flags_alone(num_steps):
     cfg = load_env_cfg(GO1)
     fine = (cfg.sim.mujoco.timestep, cfg.decimation)
-    undo = coarsen_physics(cfg)
-    assert (cfg.sim.mujoco.timestep, cfg.decimation) == (2 * fine[0], fine[1] // 2)
+    undo = coarsen_physics(cfg, num_steps)
+    assert cfg.decimation == num_steps
+    assert cfg.sim.mujoco.timestep * num_steps == pytest.approx(fine[0] * fine[1])
     changed = copy.deepcopy(cfg)
     changed.sim.mujoco.timestep, changed.decimation = 0.002, 10
     for one, expected in ((cfg, fine), (changed, (0.002, 10))):
@@ -152,11 +154,10 @@ def test_coarse_physics_keeps_the_time_of_a_step_and_leaves_flags_alone():
         assert (one.sim.mujoco.timestep, one.decimation) == expected
 
 
-def test_an_odd_number_of_physics_steps_has_no_half():
-    cfg = load_env_cfg(GO1)
-    cfg.decimation = 5
-    with pytest.raises(ValueError, match="half of 5 steps"):
-        coarsen_physics(cfg)
+@pytest.mark.parametrize("num_steps", [0, 4, 5])
+def test_coarse_physics_has_fewer_steps(num_steps):
+    with pytest.raises(ValueError, match="fewer than the task's 4, got"):
+        coarsen_physics(load_env_cfg(GO1), num_steps)
 
 
 # Difficulty.

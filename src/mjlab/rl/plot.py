@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,6 +31,18 @@ def read_scalars(run_dir: str | Path, tag: str) -> Curve:
     Raises:
         ValueError: there are no event files, or they have no such tag; the tags are listed.
     """
+    curves = read_all_scalars(run_dir)
+    if tag not in curves:
+        raise ValueError(f"The run {str(run_dir)!r} has no figure {tag!r}. Figures: {[*curves]}.")
+    return curves[tag]
+
+
+def read_all_scalars(run_dir: str | Path) -> dict[str, Curve]:
+    """Return for each tag in the event files of `run_dir` what `read_scalars` does.
+
+    Raises:
+        ValueError: there are no event files.
+    """
     from tensorboard.backend.event_processing import event_accumulator
 
     run_dir = Path(run_dir)
@@ -44,12 +56,13 @@ def read_scalars(run_dir: str | Path, tag: str) -> Curve:
         str(run_dir), size_guidance={event_accumulator.SCALARS: 0}
     )
     accumulator.Reload()
-    tags = accumulator.Tags()["scalars"]
-    if tag not in tags:
-        raise ValueError(f"The run {str(run_dir)!r} has no figure {tag!r}. Figures: {tags}.")
-    by_iteration = {event.step: event.value for event in accumulator.Scalars(tag)}
-    iterations = sorted(by_iteration)
-    return np.array(iterations), np.array([by_iteration[i] for i in iterations], dtype=float)
+    curves = {}
+    for tag in accumulator.Tags()["scalars"]:
+        by_iteration = {event.step: event.value for event in accumulator.Scalars(tag)}
+        iterations = sorted(by_iteration)
+        values = np.array([by_iteration[i] for i in iterations], dtype=float)
+        curves[tag] = (np.array(iterations), values)
+    return curves
 
 
 def plot_run(
@@ -80,7 +93,8 @@ def plot_run(
     def draw(axes: Axes) -> None:
         axes.plot(curve[0] + 1, curve[1])
 
-    _draw_figure(draw, output, tag, run_dir.resolve().name if title is None else title)
+    title = run_dir.resolve().name if title is None else title
+    _draw_figure(draw, output, title, "Iteration", _LABELS.get(tag, tag))
     return output
 
 
@@ -112,23 +126,54 @@ def plot_seeds(
     if not groups or not all(groups.values()):
         raise ValueError("There are no runs to draw; give the folder of at least one.")
     curves = {
-        name: mean_and_std([read_scalars(run, tag) for run in runs])
+        name: [
+            (iterations + 1, values)
+            for iterations, values in (read_scalars(run, tag) for run in runs)
+        ]
         for name, runs in groups.items()
     }
     seeds = max(len(runs) for runs in groups.values())
+    default = f"Mean over {seeds} seeds (shaded: one sample standard deviation)"
+    return plot_curves(
+        curves, output, title=default if title is None else title, ylabel=_LABELS.get(tag, tag)
+    )
 
-    def draw(axes: Axes) -> None:
-        for name, (iterations, mean, std) in curves.items():
-            (line,) = axes.plot(iterations + 1, mean, label=name or None)
-            axes.fill_between(
-                iterations + 1, mean - std, mean + std, alpha=0.25, color=line.get_color(), lw=0
-            )
-        if any(curves):
+
+def plot_curves(
+    groups: Mapping[str, Sequence[Curve]],
+    output: str | Path,
+    *,
+    title: str,
+    xlabel: str = "Iteration",
+    ylabel: str,
+    draw: Callable[[Axes], None] | None = None,
+) -> Path:
+    """Draw the mean over the curves of each group, with one sample standard deviation shaded.
+
+    Args:
+        groups: Curves by name of their group; without a name, a group is not in the legend.
+        output: The PNG.
+        title: Title of the figure.
+        xlabel: Name of the first axis.
+        ylabel: Name of the second axis.
+        draw: Draws more, after the groups.
+
+    Returns:
+        The PNG.
+    """
+
+    def draw_all(axes: Axes) -> None:
+        for name, curves in groups.items():
+            x, mean, std = mean_and_std(curves)
+            (line,) = axes.plot(x, mean, label=name or None)
+            axes.fill_between(x, mean - std, mean + std, alpha=0.25, color=line.get_color(), lw=0)
+        if draw is not None:
+            draw(axes)
+        if axes.get_legend_handles_labels()[1]:
             axes.legend()
 
     output = Path(output)
-    default = f"Mean over {seeds} seeds (shaded: one sample standard deviation)"
-    _draw_figure(draw, output, tag, default if title is None else title)
+    _draw_figure(draw_all, output, title, xlabel, ylabel)
     return output
 
 
@@ -144,7 +189,9 @@ def mean_and_std(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, np.nd
     return iterations, values.mean(axis=0), std
 
 
-def _draw_figure(draw, output: Path, tag: str, title: str) -> None:
+def _draw_figure(
+    draw: Callable[[Axes], None], output: Path, title: str, xlabel: str, ylabel: str
+) -> None:
     # The figure is made without pyplot, which would choose a window system and keep the figure.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -153,8 +200,8 @@ def _draw_figure(draw, output: Path, tag: str, title: str) -> None:
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     draw(axes)
-    axes.set_xlabel("Iteration")
-    axes.set_ylabel(_LABELS.get(tag, tag))
+    axes.set_xlabel(xlabel)
+    axes.set_ylabel(ylabel)
     axes.set_title(title)
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)

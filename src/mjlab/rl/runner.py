@@ -121,6 +121,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self.last_evaluation: EvaluationResult | None = None
         self._observations: TensorDict | None = None
         self._state_to_resume: dict[str, Any] | None = None
+        # An evaluation is due after the last iteration, and was left out to stop sooner.
+        self._owes_evaluation = False
         self._solved_check = SolvedCheck(
             env, self.alg, self.cfg.get("evaluation") or {}, int(self.cfg.get("seed", 0))
         )
@@ -163,7 +165,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 observations = self._start(init_at_random_ep_len)
                 self._tell("on_start", first, num_learning_iterations)
                 reason = self._iterate(observations, num_learning_iterations, stop)
-                self._finish(first, num_learning_iterations)
+                self._finish(first, num_learning_iterations, reason)
                 self.stop_reason = reason or "finished"
         finally:
             self.logger.stop_logging_writer()
@@ -194,6 +196,11 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     def _iterate(self, observations: TensorDict, total: int, stop: StopRequest) -> str:
         """Train until `total` iterations are finished; return why it ended before, or ""."""
         first = self.current_learning_iteration
+        if first < total:
+            is_solved = self._owes_evaluation and self._writes and self._evaluate_solved(first)
+            self._owes_evaluation = False
+            if reason := self._agree_to_stop(int(is_solved)):
+                return reason
         for iteration in range(first, total):
             begin = time.perf_counter()
             with self._speeds.explaining(self.alg.get_policy()):
@@ -294,9 +301,17 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
 
     def _reason_to_stop(self, stop: StopRequest, stats: IterationStats) -> str:
         """Return "solved" or "interrupted" if training should end here, else ""."""
+        is_due = self._solved_check.is_due(stats)
         # Whoever asks to stop does not want to wait for an evaluation first.
-        solved = not stop.requested and self._writes and self._is_solved(stats)
-        code = 2 if stop.requested else int(solved)
+        self._owes_evaluation = is_due and stop.requested
+        if stop.requested:
+            return self._agree_to_stop(2)
+        return self._agree_to_stop(
+            int(is_due and self._writes and self._evaluate_solved(stats.iteration))
+        )
+
+    def _agree_to_stop(self, code: int) -> str:
+        """Return of `_REASONS` the one at `code`, or the one that outweighs it in another process."""
         if self.is_distributed:
             # All processes have to leave the loop at the same iteration.
             shared = torch.tensor(code, device=self.device)
@@ -304,8 +319,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             code = int(shared.item())
         return _REASONS[code]
 
-    def _finish(self, first: int, total: int) -> None:
-        if self.current_learning_iteration == first:
+    def _finish(self, first: int, total: int, reason: str) -> None:
+        # A run that is solved as it is resumed leaves a checkpoint as others do.
+        if self.current_learning_iteration == first and reason != "solved":
             if total <= first:
                 logger.warning(
                     "Nothing to train: the checkpoint has finished %d iterations, and "
@@ -331,11 +347,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
 
     # Evaluation while training.
 
-    def _is_solved(self, stats: IterationStats) -> bool:
-        """Evaluate the policy if it may have solved the task; return whether to stop for it."""
-        check, iteration = self._solved_check, stats.iteration
-        if not check.is_due(stats):
-            return False
+    def _evaluate_solved(self, iteration: int) -> bool:
+        """Evaluate the policy after `iteration` iterations; return whether to stop for it."""
+        check = self._solved_check
         check.last_iteration = iteration
         result = self.evaluate()
         is_good = check.is_solved_by(result)
@@ -382,6 +396,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             "env_state": {"common_step_counter": int(counter)},
         }
         checkpoint["last_evaluated"] = self._solved_check.last_iteration
+        checkpoint["owes_evaluation"] = self._owes_evaluation
         checkpoint["training_state"] = training_state.capture(
             self.env, self.alg, self.logger, observations
         )
@@ -426,6 +441,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             finished = checkpoint.get("iterations_finished", checkpoint.get("iter", -1) + 1)
             self.current_learning_iteration = finished
             self._solved_check.last_iteration = checkpoint.get("last_evaluated", 0)
+            self._owes_evaluation = checkpoint.get("owes_evaluation", False)
         infos = checkpoint.get("infos") or {}
         counter = (infos.get("env_state") or {}).get("common_step_counter")
         if counter is not None:

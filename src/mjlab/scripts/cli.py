@@ -35,12 +35,15 @@ _LAZY_ERRORS = (
 class UserError(Exception):
     """A mistake in what was asked for, told in one message."""
 
+    exit_status = 1
+    """Exit status of the command."""
+
 
 def run_command(command: Callable[[list[str]], None]) -> NoReturn:
     """Run `command` with the command line's arguments and exit.
 
-    An error that a user can mend is printed as one message, and the exit status is 1. Anything
-    else is a defect of the program and keeps its traceback.
+    An error that a user can mend is printed as one message, and the exit status is 1 or that of a
+    `UserError`. Anything else is a defect of the program and keeps its traceback.
     """
     # torch's idle threads would otherwise spin, and take the cores from the physics threads.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -68,7 +71,8 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
         # Of several processes, the one that failed and the first have something to say.
         if rank == "0" or not blameless:
             _print_error(error, rank)
-        sys.exit(OTHER_PROCESS_STATUS if blameless else 1)
+        status = error.exit_status if isinstance(error, UserError) else 1
+        sys.exit(OTHER_PROCESS_STATUS if blameless else status)
     sys.exit(0)
 
 

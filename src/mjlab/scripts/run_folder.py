@@ -84,6 +84,35 @@ def write_run_info(run_dir: Path, **info: Any) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def write_resumed(run_dir: Path, checkpoint: Path) -> None:
+    """Record in `run_dir` that its run goes on from `checkpoint`."""
+    experiment = run_dir.resolve().parent
+    checkpoint = checkpoint.resolve()
+    # Relative, so that an experiment's folder can be moved.
+    is_beside = checkpoint.is_relative_to(experiment)
+    path = checkpoint.relative_to(experiment) if is_beside else checkpoint
+    write_run_info(run_dir, resumed=str(path))
+
+
+def sessions_of(run_dir: Path) -> list[Path]:
+    """Return the folders of a run that was resumed, from its first session to `run_dir`.
+
+    Raises:
+        UserError: the folder of an earlier session is gone.
+    """
+    sessions = [run_dir.resolve()]
+    while (resumed := read_run_info(sessions[0]).get("resumed")) is not None:
+        # Joined to an absolute path, that path is the result.
+        earlier = (sessions[0].parent / str(resumed)).parent
+        if not earlier.is_dir() or earlier in sessions:
+            raise UserError(
+                f"{sessions[0] / _INFO_FILE} resumed: expected the folder of an earlier session, "
+                f"got {str(resumed)!r}; put that folder back."
+            )
+        sessions.insert(0, earlier)
+    return sessions
+
+
 def is_run_folder(folder: Path) -> bool:
     """Return whether training made `folder`, rather than somebody who keeps policies in it."""
     return (folder / _INFO_FILE).is_file() or (folder / "params").is_dir()

@@ -24,7 +24,12 @@ from mjlab.scripts.resume import (
     keep_number_of_environments,
     seed_to_resume,
 )
-from mjlab.scripts.run_folder import NewRunFolder, SharedRunFolder, write_run_info
+from mjlab.scripts.run_folder import (
+    NewRunFolder,
+    SharedRunFolder,
+    write_resumed,
+    write_run_info,
+)
 from mjlab.scripts.task_options import options_of, prepare_env_cfg, with_task_options
 from mjlab.scripts.train_checks import check_flags
 from mjlab.scripts.training_device import training_device
@@ -175,7 +180,7 @@ def _train(
                 print(f"Resumed: {checkpoint}, iteration {runner.current_learning_iteration}")
             print(f"Run:     {folder.path}", flush=True)
             if rank.is_first:
-                _write_params(task, cfg, folder.path)
+                _write_params(task, cfg, folder.path, checkpoint)
             _learn(task, cfg, runner, folder)
         finally:
             env.close()
@@ -270,11 +275,13 @@ def _core_for_learner(cfg: TrainConfig, device: str, rank: ProcessRank) -> Gener
         sim.num_threads = 0
 
 
-def _write_params(task: str, cfg: TrainConfig, run_dir: Path) -> None:
+def _write_params(task: str, cfg: TrainConfig, run_dir: Path, checkpoint: Path | None) -> None:
     from mjlab.utils.os import dump_yaml
 
     learner = learner_of(cfg.agent)
     write_run_info(run_dir, task=task, profile=cfg.profile, learner=learner, command=sys.argv)
+    if checkpoint is not None:
+        write_resumed(run_dir, checkpoint)
     dump_yaml(run_dir / "params" / "env.yaml", asdict(cfg.env))
     dump_yaml(run_dir / "params" / "agent.yaml", asdict(cfg.agent))
 
@@ -344,7 +351,9 @@ def _leave_results(task: str, cfg: TrainConfig, run_dir: Path, device: str) -> N
     from mjlab.rl.checkpoint import latest_checkpoint
     from mjlab.rl.plot import plot_run
 
-    plot_run(run_dir, run_dir / "learning_curve.png", title=task)
+    # A run that is solved as it is resumed has no iteration of its own.
+    with contextlib.suppress(ValueError):
+        plot_run(run_dir, run_dir / "learning_curve.png", title=task)
     checkpoint = latest_checkpoint(run_dir)
     if cfg.result_video and checkpoint is not None:
         from mjlab.scripts.policy import policy_env_cfg

@@ -86,11 +86,11 @@ def _interrupted(experiment: Path, before: set[Path], seed: int) -> bool:
     return any(read_run_info(run).get("ended") == "interrupted" for run in new)
 
 
-def run_forwarding_signals(command: list[str]) -> tuple[int, bool]:
+def run_forwarding_signals(command: list[str], seconds: float | None = None) -> tuple[int, bool]:
     """Run `command` to its end; return its status, and whether this process was told to stop.
 
     SIGINT, SIGTERM and SIGHUP do not end this process: each goes on to `command`, once, and what
-    it then does, such as saving, is waited for.
+    it then does, such as saving, is waited for. After `seconds` it gets SIGINT.
     """
     child: subprocess.Popen[bytes] | None = None
     early: list[int] = []
@@ -115,7 +115,13 @@ def run_forwarding_signals(command: list[str]) -> tuple[int, bool]:
         child = subprocess.Popen(command, start_new_session=True)
         for number in early:
             forward(number)
-        return child.wait(), stopped
+        try:
+            return child.wait(seconds), stopped
+        except subprocess.TimeoutExpired:
+            # A second signal would end the child without saving.
+            if not stopped:
+                child.send_signal(signal.SIGINT)
+            return child.wait(), stopped
     finally:
         for number, old in handlers.items():
             # A handler that was not set from Python reads as None and cannot be set again.

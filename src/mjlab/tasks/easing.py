@@ -75,21 +75,22 @@ def drop_easing(env_cfg: ManagerBasedRlEnvCfg) -> None:
             del env_cfg.curriculum[name]
 
 
-def coarsen_physics(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
-    """Take half as many physics steps, of twice the length, for a step of the environment.
+def coarsen_physics(env_cfg: ManagerBasedRlEnvCfg, num_steps: int) -> Undo:
+    """Take only `num_steps` physics steps, longer ones, for a step of the environment.
 
     Histories of contact sensors keep their number of physics steps. What a flag has changed since is
     not undone.
 
     Raises:
-        ValueError: the number of physics steps is odd.
+        ValueError: these are no fewer steps.
     """
     fine = (env_cfg.sim.mujoco.timestep, env_cfg.decimation)
-    if env_cfg.decimation % 2:
+    if not 1 <= num_steps < env_cfg.decimation:
         raise ValueError(
-            f"The physics cannot take half of {env_cfg.decimation} steps; decimation has to be even."
+            f"num_steps: expected 1 to {env_cfg.decimation - 1} physics steps, fewer than the task's "
+            f"{env_cfg.decimation}, got {num_steps}."
         )
-    coarse = (2.0 * fine[0], fine[1] // 2)
+    coarse = (fine[0] * fine[1] / num_steps, num_steps)
     env_cfg.sim.mujoco.timestep, env_cfg.decimation = coarse
 
     def undo(eased: ManagerBasedRlEnvCfg) -> None:

@@ -129,6 +129,145 @@ def test_a_clock_without_a_velocity_command_always_runs(make_env):
     assert clock(env).command.norm(dim=1).tolist() == pytest.approx([1.0] * 4)
 
 
+def test_a_fading_clock_starts_where_it_is_told_and_grows_and_falls_linearly(make_env):
+    def edit(cfg: Any) -> None:
+        cfg.commands["gait"].starts, cfg.commands["gait"].fade_s = (0.0, 0.5), 0.2
+
+    env = make_env(num_envs=16, edit=edit)
+    assert set(clock(env).cycles.tolist()) == {0.0, 0.5}
+    standing = torch.arange(16) % 2 == 1
+    rows = torch.where(standing, 0.0, 1.0)[:, None] * torch.tensor([[1.0, 0.0, 0.0]])
+    twist: Any = env.command_manager.get_term("twist")
+    twist.cfg.resampling_time_range = (1e9, 1e9)
+    twist.time_left[:] = 1e9
+    twist.cfg.rel_heading_envs = 0.0
+    twist.is_heading_env[:] = twist.is_standing_env[:] = False
+    for row, walks in ((rows, ~standing), (rows.flip(0), standing)):
+        twist.vel_command_b[:] = row
+        before = clock(env).amplitude.clone()
+        for step in range(1, 13):
+            env.step(no_action(env))
+            change = torch.where(walks, 1.0, -1.0) * min(step / 10, 1.0)
+            torch.testing.assert_close(clock(env).amplitude, (before + change).clamp(0.0, 1.0))
+    norm = clock(env).command.norm(dim=1)
+    torch.testing.assert_close(norm, clock(env).amplitude)
+    env.reset()
+    assert (clock(env).amplitude == 0.0).all()
+
+
+def march_cfg(task: str, joints: dict[str, float]):
+    """Return an edit that adds a march with these joints of each leg, named without the leg."""
+    legs = {G1: ("left", "right"), GO1: ("FR", "FL", "RR", "RL")}[task]
+
+    def edit(cfg: Any) -> None:
+        cfg.actions["joint_pos"] = mdp.MarchActionCfg(
+            entity_name="robot",
+            actuator_names=(".*",),
+            scale=0.3,
+            offsets=OFFSETS[task],
+            swing=tuple({f"{leg}_{j}_joint": v for j, v in joints.items()} for leg in legs),
+        )
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("task", "joints"),
+    [(G1, {"hip_pitch": -0.4, "knee": 0.7}), (GO1, {"thigh": 0.2, "calf": -0.5})],
+)
+def test_a_march_moves_the_legs_whose_feet_are_to_swing_by_what_it_says(make_env, task, joints):
+    env = make_env(task, num_envs=8, edit=march_cfg(task, joints))
+    robot = env.scene["robot"]
+    action = 2.0 * torch.rand(8, env.action_manager.total_action_dim) - 1.0
+    expected = robot.data.default_joint_pos + 0.3 * action
+    swing = clock(env).swing(OFFSETS[task])
+    for i, leg in enumerate({G1: ("left", "right"), GO1: ("FR", "FL", "RR", "RL")}[task]):
+        for joint, value in joints.items():
+            expected[:, robot.joint_names.index(f"{leg}_{joint}_joint")] += value * swing[:, i]
+    env.action_manager.process_action(action)
+    env.action_manager.apply_action()
+    target = robot.data.joint_pos_target + robot.data.encoder_bias
+    torch.testing.assert_close(target, expected)
+    # Opposite feet swing in turn.
+    assert (swing[:, 0] * swing[:, 1] == 0.0).all()
+
+
+def test_the_mirror_image_of_a_march_is_the_march_half_a_stride_later(make_env):
+    def edit(cfg: Any) -> None:
+        march_cfg(G1, {"hip_pitch": -0.4, "knee": 0.7, "ankle_pitch": -0.3})(cfg)
+        cfg.commands["gait"].velocity_command_name = None
+
+    env = make_env(G1, edit=edit)
+    clock(env).cycles[:] = torch.tensor([0.1, 0.6, 0.3, 0.8])
+    env.action_manager.process_action(no_action(env))
+    env.action_manager.apply_action()
+    data = env.scene["robot"].data
+    moved = data.joint_pos_target + data.encoder_bias - data.default_joint_pos
+    assert moved.abs().amax() > 0.1
+    _, images = mirror_left_right(env=env, obs=None, actions=moved)
+    torch.testing.assert_close(images[4:], moved[[1, 0, 3, 2]])
+
+
+def test_a_march_that_does_not_fit_is_refused_when_built(make_env):
+    def edit(cfg: Any, **changes: Any) -> None:
+        march_cfg(G1, {"knee": 0.7})(cfg)
+        for name, value in changes.items():
+            setattr(cfg.actions["joint_pos"], name, value)
+
+    with pytest.raises(ValueError, match="expected one dict for each of the 3 offsets, got 2"):
+        make_env(edit=lambda cfg: edit(cfg, offsets=(0.0, 0.3, 0.6)))
+    with pytest.raises(ValueError, match="expected a GaitClockCommand"):
+        make_env(edit=lambda cfg: edit(cfg, command_name="twist"))
+    with pytest.raises(ValueError, match="elbows"):
+        make_env(edit=lambda cfg: edit(cfg, swing=({"elbows": 1.0}, {})))
+
+
+def feet_cfg(env: ManagerBasedRlEnv) -> SceneEntityCfg:
+    cfg = SceneEntityCfg("robot", site_names=SITES[G1])
+    cfg.resolve(env.scene)
+    return cfg
+
+
+def test_the_height_over_the_feet_is_that_of_the_root_wherever_the_ground_is(make_env):
+    env = make_env()
+    feet, robot = feet_cfg(env), env.scene["robot"]
+    height = mdp.height_over_feet(env, feet)
+    assert ((height > 0.7) & (height < 0.85)).all()
+    cost = mdp.root_height_l2(env, 0.7, feet)
+    torch.testing.assert_close(cost, (height - 0.7).square())
+    state = robot.data.root_link_pose_w.clone()
+    state[:, 2] += torch.tensor([0.0, 0.5, 1.0, -0.1])
+    robot.write_root_link_pose_to_sim(state)
+    env.sim.forward()
+    torch.testing.assert_close(mdp.height_over_feet(env, feet), height)
+    low, high = height.min().item() - 1e-3, height.max().item() + 1e-3
+    assert not mdp.root_near_feet(env, low, feet).any()
+    assert mdp.root_near_feet(env, high, feet).all()
+
+
+def test_feet_that_come_closer_or_cross_cost_the_square_of_what_is_missing(make_env):
+    env = make_env()
+    feet, robot = feet_cfg(env), env.scene["robot"]
+    roll = [robot.joint_names.index(f"{side}_hip_roll_joint") for side in ("left", "right")]
+    pose = robot.data.default_joint_pos.clone()
+    pose[:, roll] += torch.tensor([[0.0, 0.0], [-0.15, 0.15], [-0.3, 0.3], [0.2, -0.2]])
+    robot.write_joint_state_to_sim(pose, torch.zeros_like(pose))
+    # The costs do not depend on where the robot looks.
+    state = robot.data.root_link_pose_w.clone()
+    state[:, 3:] = torch.tensor([math.cos(0.7), 0.0, 0.0, math.sin(0.7)])
+    robot.write_root_link_pose_to_sim(state)
+    env.sim.forward()
+    cost = mdp.feet_apart_l2(env, 0.2, feet)
+    assert cost[0] < 1e-3
+    assert cost[2] > cost[1] > 1e-3
+    assert cost[3] == 0.0
+    apart = (0.2 - cost[[1, 2]].sqrt()).tolist()
+    sites = robot.data.site_pos_w[:, feet.site_ids]
+    assert apart[0] == pytest.approx((sites[1, 0] - sites[1, 1]).norm().item(), abs=0.01)
+    # Each doubles the roll, and with it what is missing from the distance of legs that hang.
+    assert apart[1] < apart[0] - 0.1
+
+
 def test_observation_and_reward_read_one_phase(make_env):
     """A reward is of the heights and the phase that the policy saw."""
     env = make_env()

@@ -49,7 +49,7 @@ def test_the_example_builds_and_steps(example, name, play):
 
 
 def test_the_snippet_about_mirror_images_is_that_of_the_profile(example):
-    profile = load_rl_cfg("Mjlab-Velocity-Flat-Unitree-G1", profile="cpu")
+    profile = load_rl_cfg("Mjlab-Velocity-Flat-Unitree-Go1", profile="cpu")
     assert example["rl_cfg"].algorithm.symmetry_cfg == profile.algorithm.symmetry_cfg
 
 

@@ -45,7 +45,7 @@ _UNPUSHED_SAMPLES = 12_000_000
 def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     """Edit the configs of a tracking task in place."""
     env_cfg.scene.num_envs = _NUM_ENVS
-    undos = [drop_easing, coarsen_physics(env_cfg), play_motions_once]
+    undos = [drop_easing, coarsen_physics(env_cfg, num_steps=2), play_motions_once]
     rl_cfg.evaluation.prepare_env = undo_all(undos)
     penalty = env_cfg.rewards[_ACTION_RATE]
     if penalty is not None:

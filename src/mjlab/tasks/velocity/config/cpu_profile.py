@@ -50,23 +50,6 @@ def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     evaluation.solved_below = {"lin_vel_error": 0.25, "ang_vel_error": 0.35, "failure_rate": 0.05}
 
 
-def cpu_humanoid(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
-    """Edit the configs of a humanoid's velocity task in place.
-
-    Solved means that it stands and steps: four of five episodes last to their end, and the command is
-    followed better than standing still would.
-    """
-    cpu(env_cfg, rl_cfg)
-    # More joints need less noise each for a body to be thrown about as much.
-    rl_cfg.algorithm.entropy_coef = 0.005
-    rl_cfg.actor.hidden_dims = rl_cfg.critic.hidden_dims = (256, 128)
-    rl_cfg.max_iterations = 6000
-    evaluation = rl_cfg.evaluation
-    evaluation.trigger_return = 2500.0
-    evaluation.min_interval = 100
-    evaluation.solved_below = {"lin_vel_error": 0.4, "failure_rate": 0.2}
-
-
 def _ease_rewards(env_cfg: ManagerBasedRlEnvCfg) -> None:
     for name, term in env_cfg.rewards.items():
         if term is None or (term.weight >= 0 and name != _AIR_TIME):

@@ -46,23 +46,29 @@ class GaitClockCommandCfg(CommandTermCfg):
     """Velocity command that asks to stand. None: the clock always runs."""
     standing_threshold: float = 0.1
     """Commanded motion `|c_xy| + |c_z|` below which the clock stands."""
+    starts: tuple[float, ...] | None = None
+    """Offsets o to draw from (strides), such as (0, 0.5): both feet on the ground. None: any."""
+    fade_s: float = 0.0
+    """Time in which the amplitude grows from 0 to 1 after resets and standing, and falls again (s)."""
 
     def build(self, env: ManagerBasedRlEnv) -> GaitClockCommand:
         """Return the term.
 
         Raises:
-            ValueError: frequency is not positive, or the velocity command does not exist.
+            ValueError: frequency is not positive, fade_s is negative, or the velocity command does
+                not exist.
         """
         return GaitClockCommand(self, env)
 
 
 class GaitClockCommand(CommandTerm):
-    """Clock of a periodic gait with frequency f, (sin phi, cos phi), where
+    """Clock of a periodic gait with frequency f, (A sin phi, A cos phi), where
 
         phi = 2 pi (f t + o)
 
-    with t the time since the reset (s), and o in [0, 1) drawn at each reset. Where the velocity
-    command asks to stand, the command is (0, 0), and the phase goes on unseen.
+    with t the time since the reset (s), and o in [0, 1) drawn at each reset. The amplitude A is 1, and
+    0 where the velocity command asks to stand, with the phase going on unseen; with `fade_s` it begins
+    at 0 and goes to either linearly.
 
     Attributes:
         cycles: (N,) phase in strides, `f t + o` modulo 1.
@@ -74,6 +80,8 @@ class GaitClockCommand(CommandTerm):
         super().__init__(cfg, env)
         if not cfg.frequency > 0.0:
             raise ValueError(f"frequency: expected a positive number (Hz), got {cfg.frequency!r}.")
+        if not cfg.fade_s >= 0.0:
+            raise ValueError(f"fade_s: expected a time of at least 0 s, got {cfg.fade_s!r}.")
         # The manager of commands is still being built, so the config says which there are.
         name, names = cfg.velocity_command_name, list(env.cfg.commands)
         if name is not None and env.cfg.commands.get(name) is None:
@@ -82,15 +90,19 @@ class GaitClockCommand(CommandTerm):
                 "for a clock that always runs."
             )
         self.cycles = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
+        self._faded = torch.zeros_like(self.cycles)
 
     @property
     def command(self) -> torch.Tensor:
-        """The clock (sin phi, cos phi), (N, 2); zero where it stands."""
+        """The clock (A sin phi, A cos phi), (N, 2)."""
         phase = self.phase
         clock = torch.stack((torch.sin(phase), torch.cos(phase)), dim=1)
-        if self.cfg.velocity_command_name is None:
-            return clock
-        return clock.masked_fill_(self.is_standing.unsqueeze(1), 0.0)
+        return clock.mul_(self.amplitude.unsqueeze(1))
+
+    @property
+    def amplitude(self) -> torch.Tensor:
+        """The amplitude A, (N,)."""
+        return self._faded if self.cfg.fade_s > 0.0 else (~self.is_standing).float()
 
     @property
     def phase(self) -> torch.Tensor:
@@ -107,14 +119,30 @@ class GaitClockCommand(CommandTerm):
             self.cfg.standing_threshold
         )
 
+    def swing(self, offsets: tuple[float, ...]) -> torch.Tensor:
+        """Return how far each foot is in the air, `A max(0, sin(phi + 2 pi o_i))^2`, (N, feet)."""
+        cycles = self.cycles.unsqueeze(1) + constant_tensor(tuple(offsets), self.device)
+        swing = torch.sin(cycles * (2.0 * math.pi)).clamp_(min=0.0).square_()
+        return swing.mul_(self.amplitude.unsqueeze(1))
+
     def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
         """Advance the phase by `dt` seconds; the arguments are those of `CommandTerm.compute`."""
         index = slice(None) if env_ids is None else env_ids
         self.cycles[index] = torch.remainder(self.cycles[index] + self.cfg.frequency * dt, 1.0)
+        if self.cfg.fade_s > 0.0:
+            change = torch.where(self.is_standing[index], -dt, dt) / self.cfg.fade_s
+            self._faded[index] = (self._faded[index] + change).clamp_(0.0, 1.0)
         super().compute(dt, env_ids)
 
     def _resample_command(self, env_ids: torch.Tensor) -> None:
-        self.cycles[env_ids] = torch.rand(len(env_ids), dtype=torch.float32, device=self.device)
+        starts = self.cfg.starts
+        if starts is None:
+            cycles = torch.rand(len(env_ids), dtype=torch.float32, device=self.device)
+        else:
+            drawn = torch.randint(len(starts), (len(env_ids),), device=self.device)
+            cycles = constant_tensor(starts, self.device)[drawn]
+        self.cycles[env_ids] = cycles
+        self._faded[env_ids] = 0.0
 
 
 def _check_height_by_phase(
@@ -156,10 +184,11 @@ def feet_height_by_phase(
 ) -> torch.Tensor:
     """Reward feet that swing as high as the gait clock says, and stand while it says so:
 
-        exp(-sum_i (h_i - h*_i)^2 / variance),    h*_i = swing_height max(0, sin(phi + 2 pi o_i))^2
+        exp(-sum_i (h_i - h*_i)^2 / variance),    h*_i = swing_height A max(0, sin(phi + 2 pi o_i))^2
 
-    with h_i the height of foot i above `rest_height`. Feet swing in one half of the cycle and stand
-    in the other; while the clock stands, all do. Heights and phase are those that the policy saw.
+    with h_i the height of foot i above `rest_height`, phi the phase and A the amplitude of the clock.
+    Feet swing in one half of the cycle and stand in the other; while the clock stands, all do. Heights
+    and phase are those that the policy saw.
 
     Args:
         env: The environment.
@@ -173,9 +202,7 @@ def feet_height_by_phase(
             in the soles, and 0.0225 for the Go1, whose sites are in the middle of the feet.
     """
     clock: Any = env.command_manager.get_term(command_name)
-    cycles = clock.cycles.unsqueeze(1) + constant_tensor(tuple(offsets), env.device)
-    swing = torch.sin(cycles * (2.0 * math.pi)).clamp_(min=0.0).square_()
-    target = swing.masked_fill_(clock.is_standing.unsqueeze(1), 0.0).mul_(swing_height)
+    target = clock.swing(offsets).mul_(swing_height)
     error = env.scene[height_sensor_name].data.heights - rest_height - target
     return torch.exp(error.square().sum(dim=1) / -variance)
 
@@ -269,3 +296,41 @@ def _up_at_rest(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tens
         matrices = data.xmat[asset.indexing.body_ids[asset_cfg.body_ids].cpu()]
     # The third row of a rotation matrix is world z in the rotated frame.
     return torch.tensor(matrices[:, 6:], dtype=torch.float32)
+
+
+def height_over_feet(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
+    """Return the height of the root above the lowest of the feet (m), (N,); feet as `site_names`."""
+    data = env.scene[asset_cfg.name].data
+    feet = data.site_pos_w[:, columns(asset_cfg.site_ids, env.device), 2]
+    return data.root_link_pos_w[:, 2] - feet.amin(dim=1)
+
+
+def root_height_l2(
+    env: ManagerBasedRlEnv, target_height: float, asset_cfg: SceneEntityCfg
+) -> torch.Tensor:
+    """Squared distance of `height_over_feet` from `target_height` (m^2).
+
+    A robot that sinks falls seconds later, which is longer than a small discount factor looks ahead.
+    """
+    return (height_over_feet(env, asset_cfg) - target_height).square_()
+
+
+def root_near_feet(
+    env: ManagerBasedRlEnv, minimum_height: float, asset_cfg: SceneEntityCfg
+) -> torch.Tensor:
+    """`height_over_feet` is less than `minimum_height` (m)."""
+    return height_over_feet(env, asset_cfg) < minimum_height
+
+
+def feet_apart_l2(
+    env: ManagerBasedRlEnv, distance: float, asset_cfg: SceneEntityCfg
+) -> torch.Tensor:
+    """Squared shortfall (m^2) of what the left foot is to the left of the right one, to `distance`.
+
+    A robot whose feet come closer trips over them. Sideways is y of the root's frame; feet are given
+    as `site_names`, the left one first.
+    """
+    data = env.scene[asset_cfg.name].data
+    feet = data.site_pos_w[:, columns(asset_cfg.site_ids, env.device)]
+    apart = quat_apply_inverse(data.root_link_quat_w, feet[:, 0] - feet[:, 1])[:, 1]
+    return (distance - apart).clamp_(min=0.0).square_()

@@ -1,0 +1,468 @@
+"""Reference runs: stock tasks trained on several seeds, for `verify` and the documentation.
+
+`make reference`, or `python benchmarks/reference.py --tasks Mjlab-Cartpole-Swingup --seeds 5`, trains one
+seed after the other under the task's `cpu` profile, until the task is solved or `--minutes` are over, and
+scores the last policy by `evaluate` on a seed that was not trained with. After each seed it writes
+
+- `src/mjlab/reference/TASK.cpu.json` (or `gpu`), which ships with the package and is read by `verify`,
+- `docs/reference/index.md`, and the picture of the task beside it.
+
+Seeds that a file has already are kept. Interrupted ones are resumed, unless the code was changed in
+between, because a seed is of one commit: they are then trained from the start. `--again` replaces seeds of
+other commits.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import importlib.metadata
+import json
+import os
+import re
+import shlex
+import shutil
+import sys
+import time
+import tomllib
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT / "src"), str(ROOT / "benchmarks")]
+
+from commands import output_of  # noqa: E402 - found by the lines above.
+from report import processor  # noqa: E402
+from solving import EVALUATION_SEED  # noqa: E402
+
+from mjlab.rl.plot import plot_curves  # noqa: E402
+from mjlab.scripts.cli import UserError, resolve_device  # noqa: E402
+from mjlab.scripts.reference import (  # noqa: E402
+    DATA,
+    ENDED,
+    FIGURE,
+    Kind,
+    Reference,
+    RunRecord,
+    SeedRecord,
+    read_run,
+    reference_path,
+    thinned,
+)
+from mjlab.scripts.run_folder import checkpoints_in, read_run_info  # noqa: E402
+from mjlab.scripts.train_seeds import run_forwarding_signals  # noqa: E402
+from mjlab.tasks.registry import UnknownTaskError, list_profiles, list_tasks, require_task  # noqa: E402
+from mjlab.utils.processes import available_cores  # noqa: E402
+
+PAGES = ROOT / "docs" / "reference"
+PROFILE = "cpu"
+KINDS: tuple[Kind, ...] = ("cpu", "gpu")
+MINUTES = 60.0
+SEEDS = {"Mjlab-Cartpole-Swingup": 5}
+"""Seeds of tasks that are trained in seconds; others have three."""
+# For a task without the profile: tasks have one environment, and an evaluation of the cartpole takes as
+# long as ten iterations.
+_FLAGS = ["--num-envs", "512", "--agent.evaluation.min-interval", "6"]
+# Curves are to begin at the start, and not where training data hint that the task may be solved.
+_EVALUATIONS = ["--agent.evaluation.trigger-return", "-1e9"]
+_LIBRARIES = ("mujoco", "torch", "rsl-rl-lib")
+_SETTINGS = "settings.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What to train, and where things go."""
+
+    device: str
+    """Torch device."""
+    minutes: float
+    """Minutes of training for a seed."""
+    again: bool
+    """Replace seeds of other commits."""
+    flags: list[str]
+    """Further flags of `train`."""
+    episodes: int
+    """Episodes of the final evaluation."""
+    data: Path
+    """Folder of the references."""
+    pages: Path
+    """Folder of the page and pictures."""
+    log_root: Path
+    """Folder of all runs, `KIND/TASK/seed_N` below it."""
+
+    @property
+    def kind(self) -> Kind:
+        """Kind of device."""
+        return "gpu" if self.device.startswith("cuda") else "cpu"
+
+
+def make(task: str, seeds: int, options: Options) -> bool:
+    """Train the missing seeds of a task; return whether to go on with other tasks.
+
+    Raises:
+        UserError: the task's file has seeds with other settings.
+        RuntimeError: a command failed.
+    """
+    reference = _reference(task, options)
+    commit = code_commit()
+    for seed in range(1, seeds + 1):
+        there = next((record for record in reference.seeds if record.seed == seed), None)
+        if there is not None and not _is_stale(there, commit, options):
+            print(f"{task}, seed {seed}: kept, of commit {there.commit}", flush=True)
+            continue
+        print(f"{task}, seed {seed} of {seeds}", flush=True)
+        record = _train(reference, seed, commit, options)
+        if record is None:
+            print("Stopped. The same command goes on from here.")
+            return False
+        reference.put(record)
+        reference.save(options.data)
+        write_pages(options.data, options.pages, (task,))
+    return True
+
+
+def _is_stale(record: SeedRecord, commit: str, options: Options) -> bool:
+    if options.again and record.commit != commit:
+        return True
+    return record.run.ended == "minutes" and record.minutes_limit < options.minutes
+
+
+def _reference(task: str, options: Options) -> Reference:
+    """Return the file of a task, or a reference without seeds."""
+    profile = PROFILE if PROFILE in list_profiles(task) else None
+    flags = [*([] if profile else _FLAGS), *_EVALUATIONS, *options.flags]
+    new = Reference(task=task, kind=options.kind, profile=profile, flags=flags)
+    path = reference_path(options.data, task, options.kind)
+    if not path.is_file():
+        return new
+    old = Reference.load(path)
+    if (old.profile, old.flags) == (profile, flags):
+        return old
+    if options.again:
+        return new
+    raise UserError(
+        f"{path} flags: expected {shlex.join(new.train_flags)}, got {shlex.join(old.train_flags)}; "
+        "use AGAIN=1 to replace all of its seeds."
+    )
+
+
+def _train(reference: Reference, seed: int, commit: str, options: Options) -> SeedRecord | None:
+    """Train a seed, or what is left of it, and score it; None if this process was told to stop."""
+    folder = options.log_root / options.kind / reference.task / f"seed_{seed}"
+    _clear_unless_same(folder, {"commit": commit, "flags": reference.train_flags})
+    run = _newest_run(folder)
+    left = 60.0 * options.minutes - (read_run(run).seconds if run else 0.0)
+    if left > 0 and (run is None or read_run_info(run).get("ended") not in ENDED):
+        command = [sys.executable, "-m", "mjlab.scripts.train", reference.task]
+        command += [*reference.train_flags, "--agent.seed", str(seed), "--device", options.device]
+        command += ["--log-root", str(folder)]
+        if run is not None:
+            command += ["--agent.resume", "True", "--agent.load-run", re.escape(run.name)]
+        begin = time.monotonic()
+        status, stopped = run_forwarding_signals(command, left)
+        run = _newest_run(folder)
+        ended = None if run is None else read_run_info(run).get("ended")
+        # A signal that went to the training process alone ends it with 0 as well.
+        if stopped or (ended == "interrupted" and time.monotonic() - begin < left):
+            return None
+        # Not by the status, because the time limit may have come after training.
+        if ended not in (*ENDED, "interrupted"):
+            raise RuntimeError(f"Training of seed {seed} ended with status {status}.")
+    assert run is not None
+    record = read_run(run)
+    if record.ended not in ENDED:
+        record = dataclasses.replace(record, ended="minutes")
+    return SeedRecord(
+        seed=seed,
+        commit=commit,
+        versions=versions(),
+        machine=machine(options.device),
+        minutes_limit=options.minutes,
+        run=thinned(record),
+        evaluation=_score(reference, run, EVALUATION_SEED + seed, options),
+    )
+
+
+def _clear_unless_same(folder: Path, settings: dict[str, Any]) -> None:
+    """Remove the runs in `folder`, unless they were made with the same settings."""
+    marker = folder / _SETTINGS
+    if marker.is_file() and json.loads(marker.read_text()) == settings:
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    marker.write_text(json.dumps(settings))
+
+
+def _newest_run(folder: Path) -> Path | None:
+    """Return the newest run with a checkpoint, in any experiment."""
+    runs = (path for path in folder.glob("*/*/") if checkpoints_in(path))
+    return max(runs, key=lambda path: path.name, default=None)
+
+
+def _score(reference: Reference, run: Path, seed: int, options: Options) -> dict[str, Any]:
+    """Return the output of `evaluate` for the last policy of a run."""
+    command = [sys.executable, "-m", "mjlab.scripts.evaluate", reference.task]
+    command += ["--checkpoint-file", str(checkpoints_in(run)[-1]), "--device", options.device]
+    command += ["--num-episodes", str(options.episodes), "--seed", str(seed), "--json", "True"]
+    # What changes the task changes it for the evaluation too.
+    flags = reference.flags
+    for position, flag in enumerate(flags):
+        if flag.startswith("--env."):
+            command += flags[position : position + (1 if "=" in flag else 2)]
+    printed = output_of(command)
+    score = json.loads(printed[printed.index("{") :])
+    # A path of this machine.
+    del score["policy"]
+    return score
+
+
+def code_commit() -> str:
+    """Return the last commit that changed the package, not its references."""
+    code = ["--", "src", "pyproject.toml", ":!src/mjlab/reference"]
+    git = ["git", "-C", str(ROOT)]
+    commit = output_of([*git, "log", "-1", "--format=%h", *code]).strip()
+    is_changed = output_of([*git, "status", "--porcelain", *code]).strip()
+    return f"{commit} with changes" if is_changed else commit
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of this package and of libraries that the figures depend on."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    libraries = {name: importlib.metadata.version(name) for name in _LIBRARIES}
+    return {"mjlab": project["version"], **libraries}
+
+
+def machine(device: str) -> dict[str, Any]:
+    """Return the machine in words."""
+    gpu = None
+    if device.startswith("cuda"):
+        import torch
+
+        gpu = torch.cuda.get_device_name(device)
+    return {"cores": available_cores(), "processor": processor(), "gpu": gpu}
+
+
+# The page.
+
+_HEAD = """# Reference runs
+
+Every stock task, trained under its `cpu` profile (without one, with its own settings and 512 environments), each
+seed until its evaluations say that the task is solved, or until its time was over. `make reference` makes this page.
+[`uv run verify TASK`](../command_line.md#verify) trains one more seed and compares it with these.
+
+- **Samples** are environment steps, over all environments. **Minutes** are those of collecting and learning. Evaluations
+  come on top; these runs have more of them than others, from their start on, so that there are curves.
+- **Final** is what `evaluate` says of the last policies, on seeds that were not trained with: the mean over seeds and, in
+  brackets, the lowest and the highest end of their 95 % intervals. Figures that decide whether a task is solved are
+  shown; all are below.
+- Curves are mean returns of evaluations, over seeds, with one sample standard deviation shaded.
+"""
+
+
+def write_pages(data: Path, pages: Path, tasks: tuple[str, ...] = ()) -> None:
+    """Write the page of all references in `data`, and the pictures of `tasks`."""
+    pages.mkdir(parents=True, exist_ok=True)
+    for task in tasks:
+        _draw([reference for kind in KINDS if (reference := _load(data, task, kind))], pages)
+    (pages / "index.md").write_text(page(data))
+
+
+def page(data: Path) -> str:
+    """Return the page of all references in `data`, as Markdown."""
+    head = [
+        "| task | CPU: samples | minutes | final | GPU: samples | minutes | final |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    rows, sections = [], []
+    for task in stock_tasks():
+        references = {kind: _load(data, task, kind) for kind in KINDS}
+        made = [reference for reference in references.values() if reference and reference.seeds]
+        name = f"[{task}](#{task.lower()})" if made else task
+        cells = [cell for reference in references.values() for cell in _summary(reference)]
+        rows.append(f"| {name} | {' | '.join(cells)} |")
+        if made:
+            sections.append(_section(task, made))
+    return "\n".join([_HEAD, *head, *rows, "", *sections])
+
+
+def stock_tasks() -> list[str]:
+    """Return the tasks that come with the package."""
+    return [task for task in list_tasks() if task.startswith("Mjlab-")]
+
+
+def _load(data: Path, task: str, kind: Kind) -> Reference | None:
+    path = reference_path(data, task, kind)
+    return Reference.load(path) if path.is_file() else None
+
+
+def _summary(reference: Reference | None) -> tuple[str, str, str]:
+    """Return samples, minutes and final figures of a reference, for the table."""
+    if reference is None or not reference.seeds:
+        return "not run", "", ""
+    runs = [seed.run for seed in reference.seeds]
+    final = "; ".join(
+        f"{_words(name)} {_final(name, [seed.evaluation for seed in reference.seeds])}"
+        for name in _deciding(reference)
+    )
+    solved = sum(run.ended == "solved" for run in runs)
+    return (
+        f"{_spread([run.samples / 1e6 for run in runs])} M",
+        _spread([run.seconds / 60.0 for run in runs]),
+        f"{solved} of {len(runs)} solved; {final}",
+    )
+
+
+def _deciding(reference: Reference) -> list[str]:
+    """Return the figures by which the task counts as solved; the return where nothing is said."""
+    from mjlab.tasks.registry import load_rl_cfg
+
+    cfg = load_rl_cfg(reference.task, profile=reference.profile).evaluation
+    names = [FIGURE] if cfg.solved_return is not None else []
+    names += [*cfg.solved_below, *cfg.solved_above]
+    known = [name for name in names if _figure(reference.seeds[0].evaluation, name) is not None]
+    return known or [FIGURE]
+
+
+def _section(task: str, references: list[Reference]) -> str:
+    """Return the picture of a task, and a table of its seeds for each kind of device."""
+    lines = [f"## {task}", "", f"![Curves of {task}]({task}.png)", ""]
+    for reference in references:
+        newest = reference.seeds[-1]
+        names = _all_figures(newest.evaluation)
+        libraries = ", ".join(f"{name} {value}" for name, value in newest.versions.items())
+        cores = f"{newest.machine['cores']} cores ({newest.machine['processor']})"
+        where = ", ".join(filter(None, (newest.machine["gpu"], cores)))
+        lines += [
+            f"`train {shlex.join([task, *reference.train_flags])}`, on {where}, {libraries}:",
+            "",
+            f"| seed | commit | ended | samples | minutes | steps/s | {' | '.join(map(_words, names))} |",
+            f"|{' --- |' * (6 + len(names))}",
+        ]
+        for seed in reference.seeds:
+            run = seed.run
+            cells = [str(seed.seed), seed.commit, run.ended, f"{run.samples / 1e6:.3g} M"]
+            cells += [f"{run.seconds / 60.0:.3g}", f"{run.steps_per_second:,.0f}"]
+            cells += [_final(name, [seed.evaluation]) for name in names]
+            lines.append(f"| {' | '.join(cells)} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _all_figures(evaluation: dict[str, Any]) -> list[str]:
+    rates = ("success_rate", "failure_rate")
+    return [FIGURE, *(r for r in rates if evaluation[r] is not None), *evaluation["metrics"]]
+
+
+def _figure(evaluation: dict[str, Any], name: str) -> tuple[float, float, float] | None:
+    """Return a figure of an evaluation with the ends of its interval; None if it has none."""
+    if name in evaluation["metrics"]:
+        value, interval = evaluation["metrics"][name].values()
+    else:
+        value = evaluation.get(name)
+        interval = evaluation.get(f"{name.removeprefix('mean_').removesuffix('_rate')}_interval")
+    return None if value is None else (value, *(interval or (value, value)))
+
+
+def _final(name: str, evaluations: list[dict[str, Any]]) -> str:
+    """Return the mean of a figure over seeds, and the outermost ends of their intervals."""
+    found = [figure for evaluation in evaluations if (figure := _figure(evaluation, name))]
+    if not found:
+        return ""
+    values, lows, highs = zip(*found, strict=True)
+    form = ".1%" if name.endswith("_rate") else ".3g" if name != FIGURE else ",.0f"
+    mean = sum(values) / len(values)
+    return f"{mean:{form}} [{min(lows):{form}}, {max(highs):{form}}]"
+
+
+def _spread(values: list[float]) -> str:
+    """Return median and range."""
+    return f"{median(values):.3g} ({min(values):.3g} to {max(values):.3g})"
+
+
+def _words(name: str) -> str:
+    return name.removeprefix("mean_").replace("_", " ")
+
+
+def _draw(references: list[Reference], pages: Path) -> None:
+    groups = {
+        f"{reference.kind.upper()}, {len(reference.seeds)} seeds": [
+            _in_millions(seed.run) for seed in reference.seeds
+        ]
+        for reference in references
+        if reference.seeds
+    }
+    task = references[0].task
+    plot_curves(
+        groups,
+        pages / f"{task}.png",
+        title=task,
+        xlabel="Samples (millions)",
+        ylabel="Mean evaluation return",
+    )
+
+
+def _in_millions(run: RunRecord):
+    samples, values = run.curve()
+    return samples / 1e6, values
+
+
+def main() -> int:
+    """Make what the command line asks for; return the exit status."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--tasks", nargs="+", help="tasks; all stock tasks without it")
+    parser.add_argument("--seeds", type=int, help="seeds 1 to N; without it 3, the swing-up 5")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help="time limit for a seed")
+    parser.add_argument("--again", action="store_true", help="replace seeds of other commits")
+    parser.add_argument("--device", help="cpu, cuda:0, ...; without it a GPU where there is one")
+    parser.add_argument("--flags", default="", help="further flags of `train`, in one word")
+    parser.add_argument("--episodes", type=int, default=256, help="of the final evaluations")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the JSON files")
+    parser.add_argument("--pages", type=Path, default=PAGES, help="folder of page and pictures")
+    parser.add_argument("--log-root", type=Path, default=ROOT / "logs" / "reference")
+    parser.add_argument("--page-only", action="store_true", help="train nothing, write the page")
+    args = parser.parse_args()
+    if args.page_only:
+        drawn = [task for task in stock_tasks() if any(_load(args.data, task, k) for k in KINDS)]
+        write_pages(args.data, args.pages, tuple(drawn))
+        return 0
+    # Commands of this checkout, wherever mjlab is installed.
+    os.environ["PYTHONPATH"] = os.pathsep.join(
+        filter(None, (str(ROOT / "src"), os.environ.get("PYTHONPATH")))
+    )
+    failed = []
+    try:
+        options = Options(
+            device=resolve_device(args.device),
+            minutes=args.minutes,
+            again=args.again,
+            flags=shlex.split(args.flags),
+            episodes=args.episodes,
+            data=args.data,
+            pages=args.pages,
+            log_root=args.log_root.resolve(),
+        )
+        tasks = args.tasks or stock_tasks()
+        for task in tasks:
+            require_task(task)
+        for task in tasks:
+            try:
+                if not make(task, args.seeds or SEEDS.get(task, 3), options):
+                    return 0
+            except (UserError, RuntimeError) as error:
+                # Other tasks may train all the same.
+                print(f"error: {task}: {error}", file=sys.stderr, flush=True)
+                failed.append(task)
+    except KeyboardInterrupt:
+        print("Stopped. The same command goes on from here.", file=sys.stderr)
+        return 130
+    except (UserError, UnknownTaskError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,263 @@
+"""Check an installation: `uv run verify TASK [flags]` trains a seed and compares it with a reference."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mjlab.scripts.cli import (
+    UserError,
+    parse_flags,
+    resolve_device,
+    run_command,
+    task_and_flags,
+    task_usage,
+)
+from mjlab.scripts.reference import (
+    DATA,
+    ENDED,
+    Comparison,
+    Kind,
+    Reference,
+    RunRecord,
+    compare,
+    read_run,
+    reference_path,
+    referenced_tasks,
+    samples_limit,
+)
+from mjlab.scripts.run_folder import read_run_info, run_folders
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from mjlab.rl.plot import Curve
+    from mjlab.scripts.train_run import TrainConfig
+
+_USAGE = task_usage(
+    "verify",
+    "Train a task with one seed and say whether its learning curve lies within the band of the "
+    "reference runs that ship with the package. Exit status: 0 within, 1 outside, 2 for a bad call.",
+    [
+        "verify Mjlab-Cartpole-Swingup",
+        "verify Mjlab-Velocity-Flat-Unitree-Go1 --device cpu --seed 1",
+    ],
+)
+_OUTSIDE, _BAD_CALL = 1, 2
+# Rows of the printed table.
+_ROWS = 5
+
+
+@dataclass
+class VerifyConfig:
+    """Flags of `verify`."""
+
+    seed: int = 0
+    """Seed to train with. References have the seeds from 1 on, so that 0 is a new one."""
+    device: str | None = None
+    """Torch device: cpu, cuda:0, ... None takes a GPU where there is one."""
+    reference: str | None = None
+    """Reference to compare with, a JSON file that `make reference` wrote. None: the one of the task
+    that ships with the package."""
+    resume: bool = False
+    """Go on with the newest `verify` run of this task and seed, which was interrupted."""
+    log_root: str = "logs/rsl_rl"
+    """Folder of all runs."""
+
+
+class BadCallError(UserError):
+    """A mistake in the command line, found before training."""
+
+    exit_status = _BAD_CALL
+
+
+def load_reference(task: str, cfg: VerifyConfig) -> Reference:
+    """Return the reference that `cfg` asks for.
+
+    Raises:
+        UserError: there is none; the message lists those there are. Or it has too few seeds.
+    """
+    if cfg.reference is not None:
+        reference = Reference.load(Path(cfg.reference))
+        if reference.task != task:
+            raise UserError(f"--reference: expected one of {task}, got one of {reference.task}.")
+        return reference
+    available = referenced_tasks(DATA)
+    # Before torch is imported, which looking for a GPU takes.
+    if task in available:
+        kind: Kind = "gpu" if resolve_device(cfg.device).startswith("cuda") else "cpu"
+        if kind in available[task]:
+            return Reference.load(reference_path(DATA, task, kind))
+        missing = f"a reference of {task} on this kind of device, {kind}"
+        use = f"--device {'cpu' if kind == 'gpu' else 'cuda'}, which has one"
+    else:
+        missing, use = f"a task with a reference, got {task!r}", "one that has"
+    listed = ", ".join(f"{name} ({', '.join(kinds)})" for name, kinds in available.items())
+    raise UserError(
+        f"verify: expected {missing}; use {use}. Available: {listed or 'none'}. In a checkout of "
+        f"mjlab, `make reference TASKS={task}` makes one, and --reference FILE takes it from a file."
+    )
+
+
+def _prepare(argv: list[str]) -> tuple[str, VerifyConfig, Reference, TrainConfig, Path | None]:
+    """Return what to compare, the training, and the finished run if there is nothing to train."""
+    task, flags = task_and_flags(argv, _USAGE)
+    cfg = parse_flags(VerifyConfig, VerifyConfig(), flags, f"verify {task}")
+    reference = load_reference(task, cfg)
+    resolve_device(cfg.device)
+    if len(reference.seeds) < 2:
+        raise UserError(
+            f"The reference of {task}: expected at least 2 seeds, got {len(reference.seeds)}; use "
+            f"`make reference TASKS={task}` for more."
+        )
+    if cfg.seed in (seed.seed for seed in reference.seeds):
+        # Allowed, since on another machine or with other libraries it is a new curve.
+        print(f"Seed {cfg.seed} is one of the reference's, so that its curve may be the same.")
+    from mjlab.scripts.train_run import parse_train_flags
+
+    train_flags = [*reference.train_flags, "--agent.seed", str(cfg.seed)]
+    train_flags += ["--agent.run-name", f"verify_seed_{cfg.seed}", "--log-root", cfg.log_root]
+    train_flags += ["--agent.max-iterations", str(_iterations(reference))]
+    train_flags += ["--device", cfg.device] if cfg.device is not None else []
+    done = None
+    if cfg.resume:
+        run_dir = _newest_run(task, cfg)
+        train_flags += ["--agent.resume", "True", "--agent.load-run", re.escape(run_dir.name)]
+        done = run_dir if read_run_info(run_dir).get("ended") in ENDED else None
+    return task, cfg, reference, parse_train_flags(task, train_flags, f"verify {task}"), done
+
+
+def _iterations(reference: Reference) -> int:
+    """Return the iterations until a healthy seed is solved; else, those of the shortest run."""
+    runs = [seed.run for seed in reference.seeds]
+    limit = samples_limit(runs)
+    if limit is None:
+        return min(run.iterations for run in runs)
+    return math.ceil(limit * runs[0].iterations / runs[0].samples)
+
+
+def _newest_run(task: str, cfg: VerifyConfig) -> Path:
+    from mjlab.tasks.registry import load_rl_cfg
+
+    experiment = Path(cfg.log_root).resolve() / load_rl_cfg(task).experiment_name
+    name = re.compile(rf".*_verify_seed_{cfg.seed}(-\d+)?")
+    for run_dir in run_folders(experiment):
+        if name.fullmatch(run_dir.name) and read_run_info(run_dir).get("task") == task:
+            return run_dir
+    raise UserError(
+        f"--resume: expected a run of `verify {task}` with seed {cfg.seed} in {experiment}, got "
+        "none; leave --resume out to begin one."
+    )
+
+
+def report(reference: Reference, run: RunRecord, comparison: Comparison) -> str:
+    """Return the comparison as text."""
+    newest = reference.seeds[-1]
+    versions = ", ".join(f"{name} {value}" for name, value in newest.versions.items())
+    speeds = [seed.run.steps_per_second for seed in reference.seeds]
+    lines = [
+        f"Reference  {len(reference.seeds)} seeds on {_machine(newest.machine)}, commit "
+        f"{newest.commit}, {versions}",
+        f"Speed      {run.steps_per_second:,.0f} steps/s (collecting and learning); reference "
+        f"{min(speeds):,.0f} to {max(speeds):,.0f}",
+        "",
+        f"{'samples':>12}  {'mean return':>12}  {'reference':>12}  band",
+    ]
+    last = len(comparison.samples) - 1
+    for row in range(_ROWS):
+        i = round(row * last / (_ROWS - 1))
+        middle, half = comparison.mean[i], comparison.half[i]
+        outside = "" if comparison.within[i] else "   outside"
+        lines.append(
+            f"{comparison.samples[i]:>12,.0f}  {comparison.values[i]:>12.4g}  {middle:>12.4g}  "
+            f"[{middle - half:.4g}, {middle + half:.4g}]{outside}"
+        )
+    if comparison.limit is not None:
+        taken = [seed.run.samples for seed in reference.seeds]
+        solved = comparison.solved_at
+        lines += [
+            "",
+            f"Solved     {'not' if solved is None else f'after {solved:,} samples'}; reference after "
+            f"{min(taken):,} to {max(taken):,}, a healthy seed within {comparison.limit:,.0f}",
+        ]
+    return "\n".join([*lines, ""])
+
+
+def _machine(machine: dict) -> str:
+    return machine.get("gpu") or f"{machine.get('cores')} cores ({machine.get('processor')})"
+
+
+def _draw(reference: Reference, run: RunRecord, comparison: Comparison, output: Path) -> Path:
+    from mjlab.rl.plot import plot_curves
+
+    def millions(record: RunRecord) -> Curve:
+        samples, values = record.curve()
+        return samples / 1e6, values
+
+    def draw(axes: Axes) -> None:
+        for sign, label in ((-1, "band of a new seed"), (1, None)):
+            edge = comparison.mean + sign * comparison.half
+            axes.plot(comparison.samples / 1e6, edge, "--", color="gray", lw=1, label=label)
+        axes.plot(*millions(run), color="tab:red", marker=".", label="this run")
+        if comparison.limit is not None:
+            axes.axvline(comparison.limit / 1e6, color="gray", ls=":", label="solved by here")
+
+    return plot_curves(
+        {
+            f"reference, {len(reference.seeds)} seeds": [
+                millions(seed.run) for seed in reference.seeds
+            ]
+        },
+        output,
+        title=reference.task,
+        xlabel="Samples (millions)",
+        ylabel="Mean evaluation return",
+        draw=draw,
+    )
+
+
+def _command(argv: list[str]) -> None:
+    from mjlab.tasks.registry import UnknownTaskError
+
+    try:
+        task, cfg, reference, train_cfg, run_dir = _prepare(argv)
+    except (UserError, UnknownTaskError, ValueError, OSError) as error:
+        raise BadCallError(str(error)) from error
+    if run_dir is None:
+        from mjlab.scripts.train_run import launch_training
+
+        run_dir = launch_training(task, train_cfg)
+    run = read_run(run_dir)
+    runs = [seed.run for seed in reference.seeds]
+    comparison = compare(runs, run, reference.standard_error)
+    print(f"\n{report(reference, run, comparison)}")
+    print(f"Picture    {_draw(reference, run, comparison, run_dir / 'verify.png')}")
+    part = f"{comparison.within.mean():.0%} of the way within the band"
+    if run.ended not in ENDED:
+        print(
+            f"So far     {part}. Training was {run.ended}: the same command with --resume goes on."
+        )
+        raise KeyboardInterrupt
+    end = "its end" if comparison.limit is None else "the samples until it is solved"
+    where = f"{part}, {end} {'within' if comparison.ends_within else 'outside'}"
+    if comparison.is_within:
+        print(f"Verdict    within: {where}.")
+        return
+    print(
+        f"Verdict    OUTSIDE: {where}. At most one healthy seed in twenty is; try --seed "
+        f"{cfg.seed + 1000} before you look for the reason."
+    )
+    sys.exit(_OUTSIDE)
+
+
+def main() -> None:
+    """Entry point of `verify`: exits 0 if the curve is within the band, 1 if not."""
+    run_command(_command)
+
+
+if __name__ == "__main__":
+    main()

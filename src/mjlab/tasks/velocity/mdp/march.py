@@ -1,0 +1,81 @@
+"""March in place: joint position targets that lift the feet by the gait clock.
+
+A policy that has learned to stand finds no way to a step: to lift a foot a little costs balance, and
+is paid only when it is lifted by much. So the legs march by themselves, and the policy, whose actions
+are too small to stop them, learns to keep the robot upright and to move it meanwhile (Iscen et al.,
+1910.02812, modulate trajectory generators likewise).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+
+from mjlab.envs.mdp._checks import require_command
+from mjlab.envs.mdp.actions import JointPositionAction, JointPositionActionCfg
+from mjlab.tasks.velocity.mdp.gait import GaitClockCommand
+from mjlab.utils.lab_api.string import resolve_matching_names_values
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+
+
+@dataclass(kw_only=True)
+class MarchActionCfg(JointPositionActionCfg):
+    """Joint position targets `q0 + m + scale * action`, where m marches in place."""
+
+    swing: tuple[dict[str, float], ...]
+    """For each leg, joint name pattern to what m is in the middle of a swing (rad); others 0."""
+    offsets: tuple[float, ...] = (0.0, 0.5)
+    """Offset of each leg (strides), as in `feet_height_by_phase`."""
+    command_name: str = "gait"
+    """Gait clock."""
+
+    def build(self, env: ManagerBasedRlEnv) -> MarchAction:
+        """Return the term.
+
+        Raises:
+            ValueError: there is no such gait clock, legs and offsets differ in number, or a pattern
+                matches no joint.
+        """
+        return MarchAction(self, env)
+
+
+class MarchAction(JointPositionAction):
+    """Commands joint positions (rad) around a march in place in time with the gait clock.
+
+    Leg i adds `s_i swing_i`, where s_i is the clock's `swing`. `clip` bounds the sum.
+    """
+
+    _transient = {"_clock", "_offsets", "_swing"}
+
+    def __init__(self, cfg: MarchActionCfg, env: ManagerBasedRlEnv) -> None:
+        super().__init__(cfg, env)
+        require_command(env, cfg.command_name)
+        clock = env.command_manager.get_term(cfg.command_name)
+        if not isinstance(clock, GaitClockCommand):
+            raise ValueError(
+                f"command_name: expected a GaitClockCommand, got {cfg.command_name!r}, a "
+                f"{type(clock).__name__}; use the name of a GaitClockCommandCfg."
+            )
+        if len(cfg.swing) != len(cfg.offsets):
+            raise ValueError(
+                f"swing: expected one dict for each of the {len(cfg.offsets)} offsets, got "
+                f"{len(cfg.swing)}."
+            )
+        self._clock = clock
+        self._offsets = cfg.offsets
+        self._swing = torch.zeros(len(cfg.swing), self.action_dim, device=self.device)
+        for leg, table in enumerate(cfg.swing):
+            ids, _, values = resolve_matching_names_values(table, self.target_names)
+            self._swing[leg, ids] = torch.tensor(values, dtype=torch.float32, device=self.device)
+
+    def process_actions(self, actions: torch.Tensor) -> None:
+        """Scale `actions` (N, action_dim), add default pose and march, and clip."""
+        rest = self._offset
+        self._offset = rest + self._clock.swing(self._offsets) @ self._swing
+        super().process_actions(actions)
+        # The offset that policies are exported with is the same at every phase.
+        self._offset = rest
