@@ -49,6 +49,7 @@ from mjlab.scripts.reference import (  # noqa: E402
     read_run,
     reference_path,
     thinned,
+    trained_seconds,
 )
 from mjlab.scripts.run_folder import checkpoints_in, read_run_info  # noqa: E402
 from mjlab.scripts.train_seeds import run_forwarding_signals  # noqa: E402
@@ -72,7 +73,7 @@ _SETTINGS = "settings.json"
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What to train, and where things go."""
+    """Settings of reference runs, and the folders that they write to."""
 
     device: str
     """Torch device."""
@@ -152,7 +153,7 @@ def _train(reference: Reference, seed: int, commit: str, options: Options) -> Se
     folder = options.log_root / options.kind / reference.task / f"seed_{seed}"
     _clear_unless_same(folder, {"commit": commit, "flags": reference.train_flags})
     run = _newest_run(folder)
-    left = 60.0 * options.minutes - (read_run(run).seconds if run else 0.0)
+    left = 60.0 * options.minutes - (trained_seconds(run) if run else 0.0)
     if left > 0 and (run is None or read_run_info(run).get("ended") not in ENDED):
         command = [sys.executable, "-m", "mjlab.scripts.train", reference.task]
         command += [*reference.train_flags, "--agent.seed", str(seed), "--device", options.device]

@@ -193,6 +193,15 @@ def test_an_interrupted_run_is_kept_and_goes_on(verify, tmp_path, monkeypatch):
     assert read_run(uninterrupted).figures == figures
 
 
+def test_a_run_interrupted_before_its_first_evaluation_goes_on(verify):
+    late = ["--agent.evaluation.min-interval", "3"]
+    with stopped_after(2):
+        outcome = verify("--seed", "5", edit=lambda reference: reference["flags"].extend(late))
+    assert outcome.status == 130
+    assert "no evaluation: the same command with --resume" in outcome.out
+    assert verify("--seed", "5", "--resume").status == 0
+
+
 def no_seeds(reference: dict) -> None:
     del reference["seeds"][1:]
 
@@ -325,7 +334,10 @@ def test_a_seed_whose_time_is_over_is_reported_and_goes_on_with_more_time(empty,
     assert record.evaluation["mean_return"] == whole.evaluation["mean_return"]
 
 
-def test_ctrl_c_ends_the_series_and_the_seed_is_resumed(empty, monkeypatch):
+@pytest.mark.parametrize("first_evaluation", [1, 3])
+def test_ctrl_c_ends_the_series_and_the_seed_is_resumed(empty, monkeypatch, first_evaluation):
+    flags = [*TINY, "--agent.evaluation.min-interval", str(first_evaluation)]
+
     def interrupted(command, seconds):
         with stopped_after(2):
             run_script("train", *command[3:])
@@ -333,9 +345,9 @@ def test_ctrl_c_ends_the_series_and_the_seed_is_resumed(empty, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(empty.module, "run_forwarding_signals", interrupted)
-        assert not empty.make(seeds=2)
+        assert not empty.make(seeds=2, flags=flags)
     assert not empty.path.exists()
-    assert empty.make(seeds=1)
+    assert empty.make(seeds=1, flags=flags)
     (command,) = empty.trained
     assert "--agent.resume" in command
     assert empty.reference.seeds[0].run.ended == "finished"

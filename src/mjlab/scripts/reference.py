@@ -127,7 +127,7 @@ class Reference:
         return math.sqrt(sum(error**2 for error in errors) / len(errors))
 
     def put(self, record: SeedRecord) -> None:
-        """Add a seed, in place of what there is of it."""
+        """Add a seed, or replace the record of the same seed."""
         others = [seed for seed in self.seeds if seed.seed != record.seed]
         self.seeds = sorted([*others, record], key=lambda seed: seed.seed)
 
@@ -174,37 +174,23 @@ def referenced_tasks(folder: Path) -> dict[str, list[str]]:
     return tasks
 
 
+class NotEvaluatedError(UserError):
+    """Raised for a run that ended before its first evaluation."""
+
+
 def read_run(run_dir: Path) -> RunRecord:
     """Return the evaluations of the run in `run_dir` from its event files.
 
     Where sessions overlap, because one was killed after its last checkpoint, the later one counts.
 
     Raises:
-        UserError: the run was not evaluated, or the folder of an earlier session is gone.
+        NotEvaluatedError: the run was not evaluated.
+        UserError: the folder of an earlier session is gone.
         ValueError: there are no event files.
     """
-    from mjlab.rl.plot import read_all_scalars
-
-    # By iteration, from 0.
-    seconds: dict[int, float] = {}
-    evaluations: dict[int, dict[str, float]] = {}
-    for session in sessions_of(run_dir):
-        curves = read_all_scalars(session)
-        # A session that was solved as it began has evaluations only.
-        if "Perf/collection_time" in curves:
-            iterations, collecting = curves["Perf/collection_time"]
-            learning = curves["Perf/learning_time"][1]
-            first = int(iterations[0])
-            seconds = {i: value for i, value in seconds.items() if i < first}
-            evaluations = {i: value for i, value in evaluations.items() if i < first}
-            seconds |= dict(zip(iterations.tolist(), (collecting + learning).tolist(), strict=True))
-        for tag, (iterations, values) in curves.items():
-            group, _, name = tag.partition("/")
-            if group == "Evaluation":
-                for i, value in zip(iterations.tolist(), values.tolist(), strict=True):
-                    evaluations.setdefault(i, {})[name] = value
+    seconds, evaluations = _read_sessions(run_dir)
     if not evaluations:
-        raise UserError(
+        raise NotEvaluatedError(
             f"{run_dir}: expected a run with evaluations, got none; train longer, or set "
             "--agent.evaluation.solved-return and --agent.evaluation.trigger-return."
         )
@@ -227,6 +213,35 @@ def read_run(run_dir: Path) -> RunRecord:
         figures={name: [evaluations[i][name] for i in evaluated] for name in sorted(names)},
         num_episodes=agent["evaluation"]["num_episodes"],
     )
+
+
+def trained_seconds(run_dir: Path) -> float:
+    """Return the time of collecting and learning of all sessions of a run (s), evaluated or not."""
+    return sum(_read_sessions(run_dir)[0].values())
+
+
+def _read_sessions(run_dir: Path) -> tuple[dict[int, float], dict[int, dict[str, float]]]:
+    """Return the seconds of iterations, and the figures of evaluations, by iteration from 0."""
+    from mjlab.rl.plot import read_all_scalars
+
+    seconds: dict[int, float] = {}
+    evaluations: dict[int, dict[str, float]] = {}
+    for session in sessions_of(run_dir):
+        curves = read_all_scalars(session)
+        # A session that was solved as it began has evaluations only.
+        if "Perf/collection_time" in curves:
+            iterations, collecting = curves["Perf/collection_time"]
+            learning = curves["Perf/learning_time"][1]
+            first = int(iterations[0])
+            seconds = {i: value for i, value in seconds.items() if i < first}
+            evaluations = {i: value for i, value in evaluations.items() if i < first}
+            seconds |= dict(zip(iterations.tolist(), (collecting + learning).tolist(), strict=True))
+        for tag, (iterations, values) in curves.items():
+            group, _, name = tag.partition("/")
+            if group == "Evaluation":
+                for i, value in zip(iterations.tolist(), values.tolist(), strict=True):
+                    evaluations.setdefault(i, {})[name] = value
+    return seconds, evaluations
 
 
 def thinned(run: RunRecord, points: int = _POINTS) -> RunRecord:

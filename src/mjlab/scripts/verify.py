@@ -22,6 +22,7 @@ from mjlab.scripts.reference import (
     ENDED,
     Comparison,
     Kind,
+    NotEvaluatedError,
     Reference,
     RunRecord,
     compare,
@@ -231,7 +232,13 @@ def _command(argv: list[str]) -> None:
         from mjlab.scripts.train_run import launch_training
 
         run_dir = launch_training(task, train_cfg)
-    run = read_run(run_dir)
+    try:
+        run = read_run(run_dir)
+    except NotEvaluatedError:
+        if read_run_info(run_dir).get("ended") in ENDED:
+            raise
+        print("So far     no evaluation: the same command with --resume goes on.")
+        raise KeyboardInterrupt from None
     runs = [seed.run for seed in reference.seeds]
     comparison = compare(runs, run, reference.standard_error)
     print(f"\n{report(reference, run, comparison)}")
