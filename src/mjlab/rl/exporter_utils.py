@@ -13,7 +13,18 @@ first, in its order and layout; numbers have full precision, and more keys follo
 | observation_delay | lowest and highest lag of each term, in steps |
 | step_dt, physics_dt, decimation | control period (s), physics time step (s), their ratio |
 
-A term's target is `action * action_scale + action_offset`, clipped to `action_clip`.
+A term's target is `action * action_scale + action_offset`, clipped to `action_clip`. Terms that do
+more add keys of their own (`ActionTerm.export_metadata`), such as the march of `MarchAction`:
+
+| key | value |
+| --- | --- |
+| march_swing | for each leg, angle s_i of each component in the middle of a swing (rad) |
+| march_offsets | offset o_i of each leg (strides) |
+| march_frequency, march_fade_s | strides per second (Hz), and seconds in which the amplitude A goes from 0 to 1 |
+| march_command | name of the gait clock among the commands |
+
+To the target it adds, before `action_clip`, `A sum_i s_i max(0, sin(2 pi (c + o_i)))^2` with c the phase
+of the clock in strides, which the policy observes as (A sin(2 pi c), A cos(2 pi c)).
 """
 
 from __future__ import annotations
@@ -230,6 +241,10 @@ def _action_metadata(env: ManagerBasedRlEnv) -> Metadata:
         components["clip"] += _clip_per_component(term)
     # One number where one number was configured, as mjlab 1.6 writes it.
     single = len(scales) == 1 and isinstance(scales[0], (int, float))
+    further: Metadata = {}
+    for term in terms.values():
+        for key, value in term.export_metadata().items():
+            further[key] = _rows(value) if isinstance(value, torch.Tensor) else value
     return {
         "action_scale": float(scales[0]) if single else components["scale"],
         "action_names": list(terms),
@@ -239,6 +254,7 @@ def _action_metadata(env: ManagerBasedRlEnv) -> Metadata:
         "action_target_names": components["names"],
         "action_offset": components["offset"],
         "action_clip": components["clip"],
+        **further,
     }
 
 
@@ -267,6 +283,10 @@ def _clip_per_component(term: Any) -> list[list[float]]:
 
 def _numbers(values: torch.Tensor) -> list[float]:
     return [_shortest(value) for value in values.flatten().tolist()]
+
+
+def _rows(values: torch.Tensor) -> list:
+    return _numbers(values) if values.ndim < 2 else [_numbers(row) for row in values]
 
 
 def _shortest(value: float) -> float:

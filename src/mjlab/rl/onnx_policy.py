@@ -46,6 +46,8 @@ _INTERFACE = (
     "default_joint_pos",
     "step_dt",
 )
+# Files without these are of policies whose legs do not march.
+_MARCH = ("march_swing", "march_offsets", "march_frequency", "march_fade_s")
 _ACTIONS = "actions"
 _RELATIVE_TOLERANCE = 0.01
 _ABSOLUTE_TOLERANCE = 6e-4
@@ -146,10 +148,12 @@ class OnnxPolicy(torch.nn.Module):
         differences = self._group_differences(env)
         if not differences:
             wanted = metadata_texts(get_base_metadata(env, "", self._named_groups()))
+            own = {key: self.metadata[key] for key in _INTERFACE if key in self.metadata}
+            own |= {key: self.metadata.get(key, "") for key in _MARCH}
             differences = [
-                f"{key}: the policy has {self.metadata[key]}, the environment {wanted[key]}"
-                for key in _INTERFACE
-                if key in self.metadata and not _alike(self.metadata[key], wanted.get(key, ""))
+                f"{key}: the policy has {value or 'none'}, the environment {wanted.get(key) or 'none'}"
+                for key, value in own.items()
+                if not _alike(value, wanted.get(key, ""))
             ]
         sizes = env.action_manager.total_action_dim
         if sizes != self.num_actions:

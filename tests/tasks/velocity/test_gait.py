@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,6 +14,8 @@ from velocity_tasks import task_cfg
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import ObservationTermCfg, RewardTermCfg, SceneEntityCfg
+from mjlab.rl.exporter_utils import attach_metadata_to_onnx, get_base_metadata, metadata_texts
+from mjlab.rl.onnx_policy import OnnxPolicy, OnnxPolicyError
 from mjlab.tasks.velocity import mdp
 from mjlab.tasks.velocity.gait_figures import GAIT_FIGURES
 from mjlab.tasks.velocity.symmetry import mirror_left_right
@@ -155,6 +158,24 @@ def test_a_fading_clock_starts_where_it_is_told_and_grows_and_falls_linearly(mak
     assert (clock(env).amplitude == 0.0).all()
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"starts": ()}, "starts: expected offsets from 0 to below 1"),
+        ({"starts": (0.0, 1.0)}, "starts: expected offsets from 0 to below 1"),
+        ({"fade_s": math.inf}, "fade_s: expected a time"),
+        ({"fade_s": math.nan}, "fade_s: expected a time"),
+    ],
+)
+def test_a_clock_that_cannot_run_is_refused_when_built(make_env, changes, message):
+    def edit(cfg: Any) -> None:
+        for name, value in changes.items():
+            setattr(cfg.commands["gait"], name, value)
+
+    with pytest.raises(ValueError, match=message):
+        make_env(edit=edit)
+
+
 def march_cfg(task: str, joints: dict[str, float]):
     """Return an edit that adds a march with these joints of each leg, named without the leg."""
     legs = {G1: ("left", "right"), GO1: ("FR", "FL", "RR", "RL")}[task]
@@ -206,6 +227,86 @@ def test_the_mirror_image_of_a_march_is_the_march_half_a_stride_later(make_env):
     assert moved.abs().amax() > 0.1
     _, images = mirror_left_right(env=env, obs=None, actions=moved)
     torch.testing.assert_close(images[4:], moved[[1, 0, 3, 2]])
+
+
+def test_a_deployment_has_the_march_from_the_metadata_of_the_policy(make_env):
+    def edit(cfg: Any) -> None:
+        march_cfg(G1, {"hip_pitch": -0.4, "knee": 0.7})(cfg)
+        cfg.commands["gait"].velocity_command_name = None
+
+    env = make_env(G1, num_envs=8, edit=edit)
+    action = 2.0 * torch.rand(8, env.action_manager.total_action_dim) - 1.0
+    env.action_manager.process_action(action)
+    env.action_manager.apply_action()
+    robot = env.scene["robot"].data
+    told = metadata_texts(get_base_metadata(env, "local"))
+
+    def numbers(key: str) -> torch.Tensor:
+        rows = [[float(v) for v in row.split(";")] for row in told[key].split(",")]
+        return torch.tensor(rows)
+
+    # What the policy sees of the clock: (A sin 2 pi c, A cos 2 pi c).
+    sine, cosine = env.command_manager.get_command(told["march_command"]).T
+    offsets, amplitude = numbers("march_offsets").T, torch.hypot(sine, cosine)
+    cycles = torch.atan2(sine, cosine)[:, None] / (2.0 * math.pi)
+    lifted = torch.sin(2.0 * math.pi * (cycles + offsets)).clamp(min=0.0).square()
+    march = amplitude[:, None] * (lifted @ numbers("march_swing"))
+    assert march.abs().amax() > 0.1
+    scale = float(told["action_scale"])
+    expected = action * scale + numbers("action_offset").T + march
+    torch.testing.assert_close(robot.joint_pos_target + robot.encoder_bias, expected)
+
+
+def test_a_policy_that_marches_is_refused_where_legs_do_not_and_the_other_way_round(
+    make_env, tmp_path
+):
+    plain, marching = (
+        make_env(G1, edit=edit) for edit in (scale_actions, march_cfg(G1, {"knee": 0.7}))
+    )
+    policies = []
+    for env in (plain, marching):
+        path = tmp_path / f"{len(policies)}.onnx"
+        export(env, path)
+        policies.append(OnnxPolicy(path))
+        policies[-1].check_fits(env)
+    for policy, env in ((policies[0], marching), (policies[1], plain)):
+        with pytest.raises(OnnxPolicyError, match="march_swing: the policy has"):
+            policy.check_fits(env)
+
+
+def scale_actions(cfg: Any) -> None:
+    """Give actions the scale that they have with `march_cfg`."""
+    cfg.actions["joint_pos"].scale = 0.3
+
+
+def export(env: ManagerBasedRlEnv, path: Path) -> None:
+    """Write a linear policy of the environment."""
+    size, count = (
+        env.observation_manager.group_obs_dim["actor"][0],
+        env.action_manager.total_action_dim,
+    )
+    torch.onnx.export(
+        torch.nn.Linear(size, count), (torch.zeros(1, size),), str(path), dynamo=False,
+        input_names=["obs"], output_names=["actions"],
+    )  # fmt: skip
+    attach_metadata_to_onnx(str(path), get_base_metadata(env, "local"))
+
+
+@pytest.mark.parametrize(
+    ("swing", "offsets"),
+    [
+        (({"left_knee_joint": 0.7}, {"right_knee_joint": 0.5}), (0.0, 0.5)),
+        (({"left_knee_joint": 0.7}, {"right_knee_joint": 0.7}), (0.0, 0.4)),
+    ],
+)
+def test_a_march_with_another_stride_of_the_left_leg_has_no_mirror(make_env, swing, offsets):
+    def edit(cfg: Any) -> None:
+        march_cfg(G1, {})(cfg)
+        cfg.actions["joint_pos"].swing, cfg.actions["joint_pos"].offsets = swing, offsets
+
+    env = make_env(G1, edit=edit)
+    with pytest.raises(ValueError, match="swing is not the same on the left"):
+        mirror_left_right(env=env, actions=no_action(env))
 
 
 def test_a_march_that_does_not_fit_is_refused_when_built(make_env):

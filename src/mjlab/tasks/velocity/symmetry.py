@@ -44,6 +44,8 @@ _OF_SENSOR = {
     mujoco.mjtSensor.mjSENS_VELOCIMETER: DIRECTION,
     mujoco.mjtSensor.mjSENS_ACCELEROMETER: DIRECTION,
 }
+# At which marches are compared.
+_PHASES = 17
 # Metres, or parts of a unit vector, that rays and axes may be off.
 _TOLERANCE = 1e-4
 
@@ -319,7 +321,16 @@ def _of_actions(env: ManagerBasedRlEnv, params: dict[str, Any] | None = None) ->
     scale = torch.as_tensor(term.scale, dtype=torch.float32).expand(env.num_envs, len(driven))
     if not torch.allclose(scale[:, sources], scale):
         raise ValueError(f"The actions have another scale on the left than on the right. {WITHOUT}")
-    return Mirror(sources, joints.signs[driven].tolist())
+    mirror = Mirror(sources, joints.signs[driven].tolist())
+    if isinstance(term, mdp.MarchAction):
+        cycles = torch.linspace(0.0, 1.0, _PHASES, device=env.device)
+        image = mirror(term.march_at(cycles))
+        if not torch.allclose(image, term.march_at(cycles + 0.5), atol=1e-5):
+            raise ValueError(
+                "The march's swing is not the same on the left, half a stride later, as on the right; "
+                f"use the same angles for both, and offsets that are 0.5 apart. {WITHOUT}"
+            )
+    return mirror
 
 
 def _of_feet(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:

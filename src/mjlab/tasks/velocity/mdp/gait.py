@@ -55,8 +55,8 @@ class GaitClockCommandCfg(CommandTermCfg):
         """Return the term.
 
         Raises:
-            ValueError: frequency is not positive, fade_s is negative, or the velocity command does
-                not exist.
+            ValueError: frequency is not positive, fade_s is negative or infinite, starts has no offset
+                or one outside [0, 1), or the velocity command does not exist.
         """
         return GaitClockCommand(self, env)
 
@@ -80,8 +80,13 @@ class GaitClockCommand(CommandTerm):
         super().__init__(cfg, env)
         if not cfg.frequency > 0.0:
             raise ValueError(f"frequency: expected a positive number (Hz), got {cfg.frequency!r}.")
-        if not cfg.fade_s >= 0.0:
+        if not 0.0 <= cfg.fade_s < math.inf:
             raise ValueError(f"fade_s: expected a time of at least 0 s, got {cfg.fade_s!r}.")
+        starts = cfg.starts
+        if starts is not None and not (starts and all(0.0 <= start < 1.0 for start in starts)):
+            raise ValueError(
+                f"starts: expected offsets from 0 to below 1 (strides), got {starts!r}; use None for any."
+            )
         # The manager of commands is still being built, so the config says which there are.
         name, names = cfg.velocity_command_name, list(env.cfg.commands)
         if name is not None and env.cfg.commands.get(name) is None:
@@ -121,9 +126,7 @@ class GaitClockCommand(CommandTerm):
 
     def swing(self, offsets: tuple[float, ...]) -> torch.Tensor:
         """Return how far each foot is in the air, `A max(0, sin(phi + 2 pi o_i))^2`, (N, feet)."""
-        cycles = self.cycles.unsqueeze(1) + constant_tensor(tuple(offsets), self.device)
-        swing = torch.sin(cycles * (2.0 * math.pi)).clamp_(min=0.0).square_()
-        return swing.mul_(self.amplitude.unsqueeze(1))
+        return swing_at(self.cycles, offsets).mul_(self.amplitude.unsqueeze(1))
 
     def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
         """Advance the phase by `dt` seconds; the arguments are those of `CommandTerm.compute`."""
@@ -145,6 +148,28 @@ class GaitClockCommand(CommandTerm):
         self._faded[env_ids] = 0.0
 
 
+def swing_at(cycles: torch.Tensor, offsets: tuple[float, ...]) -> torch.Tensor:
+    """Return `max(0, sin(2 pi (c + o_i)))^2` for phases c in strides, (N,), as (N, feet)."""
+    phases = cycles.unsqueeze(1) + constant_tensor(tuple(offsets), cycles.device)
+    return torch.sin(phases * (2.0 * math.pi)).clamp_(min=0.0).square_()
+
+
+def require_gait_clock(env: ManagerBasedRlEnv, command_name: str) -> GaitClockCommand:
+    """Return a gait clock.
+
+    Raises:
+        ValueError: there is no such command, or it is none.
+    """
+    require_command(env, command_name)
+    term = env.command_manager.get_term(command_name)
+    if not isinstance(term, GaitClockCommand):
+        raise ValueError(
+            f"command_name: expected a GaitClockCommand, got {command_name!r}, a "
+            f"{type(term).__name__}; use the name of a GaitClockCommandCfg."
+        )
+    return term
+
+
 def _check_height_by_phase(
     env: ManagerBasedRlEnv,
     height_sensor_name: str,
@@ -153,13 +178,7 @@ def _check_height_by_phase(
     offsets: tuple[float, ...] = (0.0, 0.5),
     **_: Any,
 ) -> None:
-    require_command(env, command_name)
-    term = env.command_manager.get_term(command_name)
-    if not isinstance(term, GaitClockCommand):
-        raise ValueError(
-            f"command_name: expected a GaitClockCommand, got {command_name!r}, a "
-            f"{type(term).__name__}; use the name of a GaitClockCommandCfg."
-        )
+    require_gait_clock(env, command_name)
     check_height_sensor(env, height_sensor_name)
     frame = require_sensor(env, height_sensor_name, TerrainHeightSensor).cfg.frame
     feet = [ref.name for ref in (frame if isinstance(frame, tuple) else (frame,))]

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from mjlab.envs.mdp._checks import require_command
 from mjlab.envs.mdp.actions import JointPositionAction, JointPositionActionCfg
-from mjlab.tasks.velocity.mdp.gait import GaitClockCommand
+from mjlab.tasks.velocity.mdp.gait import require_gait_clock, swing_at
 from mjlab.utils.lab_api.string import resolve_matching_names_values
 
 if TYPE_CHECKING:
@@ -49,28 +48,26 @@ class MarchAction(JointPositionAction):
     Leg i adds `s_i swing_i`, where s_i is the clock's `swing`. `clip` bounds the sum.
     """
 
+    cfg: MarchActionCfg
     _transient = {"_clock", "_offsets", "_swing"}
 
     def __init__(self, cfg: MarchActionCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
-        require_command(env, cfg.command_name)
-        clock = env.command_manager.get_term(cfg.command_name)
-        if not isinstance(clock, GaitClockCommand):
-            raise ValueError(
-                f"command_name: expected a GaitClockCommand, got {cfg.command_name!r}, a "
-                f"{type(clock).__name__}; use the name of a GaitClockCommandCfg."
-            )
         if len(cfg.swing) != len(cfg.offsets):
             raise ValueError(
                 f"swing: expected one dict for each of the {len(cfg.offsets)} offsets, got "
                 f"{len(cfg.swing)}."
             )
-        self._clock = clock
+        self._clock = require_gait_clock(env, cfg.command_name)
         self._offsets = cfg.offsets
         self._swing = torch.zeros(len(cfg.swing), self.action_dim, device=self.device)
         for leg, table in enumerate(cfg.swing):
             ids, _, values = resolve_matching_names_values(table, self.target_names)
             self._swing[leg, ids] = torch.tensor(values, dtype=torch.float32, device=self.device)
+
+    def march_at(self, cycles: torch.Tensor) -> torch.Tensor:
+        """Return the march (P, action_dim) (rad) at phases (P,), in strides, of a clock at full amplitude."""
+        return swing_at(cycles, self._offsets) @ self._swing
 
     def process_actions(self, actions: torch.Tensor) -> None:
         """Scale `actions` (N, action_dim), add default pose and march, and clip."""
@@ -79,3 +76,13 @@ class MarchAction(JointPositionAction):
         super().process_actions(actions)
         # The offset that policies are exported with is the same at every phase.
         self._offset = rest
+
+    def export_metadata(self) -> dict[str, list | str | float | torch.Tensor]:
+        """Return the march and its clock, under the keys of `mjlab.rl.exporter_utils`."""
+        return {
+            "march_swing": self._swing,
+            "march_offsets": list(self._offsets),
+            "march_frequency": self._clock.cfg.frequency,
+            "march_fade_s": self._clock.cfg.fade_s,
+            "march_command": self.cfg.command_name,
+        }
