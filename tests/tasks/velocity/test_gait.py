@@ -586,6 +586,16 @@ def test_gait_metrics_agree_with_what_they_are_made_of(make_env):
     assert (slip <= fastest + 1e-6).all()
 
 
+def test_the_action_rate_is_that_of_the_targets_of_a_march(make_env):
+    env = make_env(G1, edit=march_cfg(G1, {"knee": 0.7, "hip_pitch": -0.4}))
+    term: Any = env.action_manager.get_term("joint_pos")
+    for _ in range(3):
+        before = term._processed_actions.clone()
+        env.step(torch.rand_like(no_action(env)))
+    change = (term._processed_actions - before).abs().mean(dim=1)
+    torch.testing.assert_close(GAIT_FIGURES["action_rate"](env), change)
+
+
 def test_the_action_rate_does_not_depend_on_the_scale_of_actions(make_env):
     rates = []
     for scale in (0.25, 0.5):

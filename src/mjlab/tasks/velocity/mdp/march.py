@@ -46,6 +46,9 @@ class MarchAction(JointPositionAction):
     """Commands joint positions (rad) around a march in place in time with the gait clock.
 
     Leg i adds `s_i swing_i`, where s_i is the clock's `swing`. `clip` bounds the sum.
+
+    Attributes:
+        march_change: (N, action_dim) change of the march in the last step (rad).
     """
 
     cfg: MarchActionCfg
@@ -64,6 +67,8 @@ class MarchAction(JointPositionAction):
         for leg, table in enumerate(cfg.swing):
             ids, _, values = resolve_matching_names_values(table, self.target_names)
             self._swing[leg, ids] = torch.tensor(values, dtype=torch.float32, device=self.device)
+        self._march = torch.zeros_like(self._raw_actions)
+        self.march_change = torch.zeros_like(self._march)
 
     def march_at(self, cycles: torch.Tensor) -> torch.Tensor:
         """Return the march (P, action_dim) (rad) at phases (P,), in strides, of a clock at full amplitude."""
@@ -71,11 +76,19 @@ class MarchAction(JointPositionAction):
 
     def process_actions(self, actions: torch.Tensor) -> None:
         """Scale `actions` (N, action_dim), add default pose and march, and clip."""
+        march = self._clock.swing(self._offsets) @ self._swing
+        self.march_change, self._march = march - self._march, march
         rest = self._offset
-        self._offset = rest + self._clock.swing(self._offsets) @ self._swing
+        self._offset = rest + march
         super().process_actions(actions)
         # The offset that policies are exported with is the same at every phase.
         self._offset = rest
+
+    def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
+        """Zero the raw action and the march of environments (None means all)."""
+        super().reset(env_ids)
+        index = slice(None) if env_ids is None else env_ids
+        self._march[index] = self.march_change[index] = 0.0
 
     def export_metadata(self) -> dict[str, list | str | float | torch.Tensor]:
         """Return the march and its clock, under the keys of `mjlab.rl.exporter_utils`."""
