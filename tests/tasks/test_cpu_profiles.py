@@ -42,3 +42,20 @@ def test_evaluations_are_those_of_the_task_without_the_profile(task, play, tmp_p
         for group in eased.observations.values():
             del group.terms["gait"]
     assert written(eased, tmp_path / "eased.yaml") == written(plain, tmp_path / "plain.yaml")
+
+
+def test_evaluations_keep_what_a_flag_has_changed_since():
+    cfg = load_env_cfg(MARCHING[0], profile="cpu")
+    cfg.rewards["foot_slip"].weight = -3.0
+    cfg.rewards["action_rate_l2"].weight = -4.0
+    cfg.rewards["foot_clearance"] = None
+    cfg.terminations["fell_over"].params["limit_angle"] = 0.5
+    cfg.scene.entities["robot"].collisions = ()
+    load_rl_cfg(MARCHING[0], profile="cpu").evaluation.prepare_env(cfg)
+    assert cfg.rewards["foot_slip"].weight == -3.0
+    assert cfg.rewards["action_rate_l2"].weight == -4.0
+    assert cfg.rewards["foot_clearance"] is None
+    assert cfg.rewards["dof_pos_limits"].weight == -1.0
+    assert "alive" not in cfg.rewards
+    assert cfg.terminations["fell_over"].params["limit_angle"] == 0.5
+    assert cfg.scene.entities["robot"].collisions == ()

@@ -7,6 +7,7 @@ was.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,6 +17,7 @@ import torch
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.managers.curriculum_manager import CurriculumTermCfg
 from mjlab.managers.manager_base import ManagerTermBase
+from mjlab.managers.reward_manager import RewardTermCfg
 from mjlab.utils.noise import (
     ConstantNoiseCfg,
     GaussianNoiseCfg,
@@ -96,6 +98,26 @@ def coarsen_physics(env_cfg: ManagerBasedRlEnvCfg, num_steps: int) -> Undo:
     def undo(eased: ManagerBasedRlEnvCfg) -> None:
         if (eased.sim.mujoco.timestep, eased.decimation) == coarse:
             eased.sim.mujoco.timestep, eased.decimation = fine
+
+    return undo
+
+
+def replace_rewards(env_cfg: ManagerBasedRlEnvCfg, rewards: dict[str, RewardTermCfg]) -> Undo:
+    """Reward these terms instead of the task's.
+
+    Undone, the task's terms are there again, with the weights that flags have changed since, and None
+    where flags have removed one.
+    """
+    before = dict(env_cfg.rewards)
+    weights = {name: term.weight for name, term in rewards.items()}
+    env_cfg.rewards = dict(rewards)
+
+    def undo(eased: ManagerBasedRlEnvCfg) -> None:
+        now, eased.rewards = eased.rewards, copy.deepcopy(before)
+        for name in before.keys() & weights.keys():
+            term = now.get(name)
+            if term is None or term.weight != weights[name]:
+                eased.rewards[name] = term
 
     return undo
 

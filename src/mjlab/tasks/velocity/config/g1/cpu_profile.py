@@ -41,6 +41,7 @@ from mjlab.tasks.easing import (
     coarsen_physics,
     drop_easing,
     grow_difficulty,
+    replace_rewards,
     undo_all,
 )
 from mjlab.tasks.velocity import mdp
@@ -138,19 +139,21 @@ def _collide_less(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
     robot.collisions = (fewer,)
 
     def undo(eased: ManagerBasedRlEnvCfg) -> None:
-        eased.scene.entities["robot"].collisions = before
+        if eased.scene.entities["robot"].collisions == (fewer,):
+            eased.scene.entities["robot"].collisions = before
 
     return undo
 
 
 def _shape_rewards(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
     """Replace what the task rewards, and add to what it penalizes."""
-    before = dict(env_cfg.rewards)
     twist = {"command_name": "twist"}
     penalties = {
-        name: term for name, term in before.items() if term is not None and term.weight < 0.0
+        name: term
+        for name, term in env_cfg.rewards.items()
+        if term is not None and term.weight < 0.0
     }
-    env_cfg.rewards = {
+    rewards = {
         # The narrow one alone pays nothing for a first step, the wide one too little for the last.
         _LINEAR: RewardTermCfg(
             func=mdp.track_linear_velocity, weight=2.0, params={"std": 0.5, **twist}
@@ -189,19 +192,15 @@ def _shape_rewards(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
         "action_rate_l2": RewardTermCfg(func=envs_mdp.action_rate_l2, weight=-0.5),
         "dof_pos_limits": RewardTermCfg(func=envs_mdp.joint_pos_limits, weight=-2.5),
     }
-
-    def undo(eased: ManagerBasedRlEnvCfg) -> None:
-        eased.rewards = dict(before)
-
-    return undo
+    return replace_rewards(env_cfg, rewards)
 
 
 def _end_early(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
     """End episodes before all is lost: what follows teaches little."""
     fell = env_cfg.terminations["fell_over"]
     assert fell is not None
-    before = fell.params["limit_angle"]
-    fell.params["limit_angle"] = min(before, math.radians(60.0))
+    before, early = fell.params["limit_angle"], math.radians(60.0)
+    fell.params["limit_angle"] = early
     env_cfg.terminations["sank"] = TerminationTermCfg(
         func=mdp.root_near_feet,
         params={"minimum_height": 0.5, "asset_cfg": copy.deepcopy(_FEET)},
@@ -209,7 +208,8 @@ def _end_early(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
 
     def undo(eased: ManagerBasedRlEnvCfg) -> None:
         eased.terminations.pop("sank", None)
-        if (fell := eased.terminations.get("fell_over")) is not None:
+        fell = eased.terminations.get("fell_over")
+        if fell is not None and fell.params["limit_angle"] == early:
             fell.params["limit_angle"] = before
 
     return undo
