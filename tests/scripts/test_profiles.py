@@ -17,6 +17,7 @@ from mjlab.scripts.profiles import suggest_profile
 from mjlab.scripts.run_folder import read_run_info, write_run_info
 from mjlab.scripts.train_run import TrainConfig, parse_train_flags
 from mjlab.tasks import registry
+from mjlab.tasks.cpu_profile import cpu_profile
 
 PROFILED = "Test-Profiled"
 
@@ -233,3 +234,48 @@ def test_the_help_tells_of_it(run):
     outcome = run("train", PROFILED, "--profile", "cpu", "--help")
     assert "--profile" in outcome.out
     assert EvaluateConfig().profile is None
+
+
+OWN = "Own-Robot"
+GO1 = "Mjlab-Velocity-Flat-Unitree-Go1"
+
+
+@pytest.fixture
+def own_task(monkeypatch):
+    """Register a task of one's own, with a `cpu` profile."""
+    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))
+    registry.register_mjlab_task(
+        task_id=OWN,
+        env_cfg=registry.load_env_cfg(GO1),
+        play_env_cfg=registry.load_env_cfg(GO1, play=True),
+        rl_cfg=registry.load_rl_cfg(GO1),
+        profiles={
+            "cpu": cpu_profile(
+                physics_steps=2,
+                simple_contacts=True,
+                hidden_dims=(16,),
+                mirror="mjlab.tasks.velocity.symmetry:mirror_left_right",
+            )
+        },
+    )
+
+
+def test_a_task_of_ones_own_trains_and_is_evaluated_under_a_profile_made_for_it(
+    own_task, run, tmp_path
+):
+    short = ("--env.episode-length-s", "0.1", "--device", "cpu")
+    trained = run(
+        "train", OWN, "--profile", "cpu", "--log-root", str(tmp_path), "--num-envs", "4",
+        "--agent.num-steps-per-env", "4", "--agent.max-iterations", "2",
+        "--agent.evaluation.solved-return", "1e9", "--agent.evaluation.trigger-return", "-1e9",
+        "--agent.evaluation.min-interval", "2", "--agent.evaluation.num-episodes", "2", *short,
+    )  # fmt: skip
+    assert trained.status == 0, trained.err
+    assert "Evaluation after 2 iterations" in trained.out
+    (params,) = tmp_path.glob("*/*/params/env.yaml")
+    assert "decimation: 2" in params.read_text()
+    (checkpoint,) = tmp_path.glob("*/*/model_1.pt")
+    score = run(
+        "evaluate", OWN, "--checkpoint-file", str(checkpoint), "--num-episodes", "2", *short
+    )
+    assert score.status == 0, score.err

@@ -17,54 +17,51 @@ from typing import Any
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.managers import RewardTermCfg
 from mjlab.rl.config import RslRlOnPolicyRunnerCfg
-from mjlab.tasks.simple_contacts import simplify_contacts
+from mjlab.tasks.cpu_profile import cpu_profile
+from mjlab.tasks.easing import Undo
 
 _REACH, _NARROW_REACH = "lift", "lift_narrow"
 _NARROW_STD = 0.04
 
 
-def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
-    """Edit the configs of the task from the state in place."""
-    env_cfg.scene.num_envs = 512
-    rl_cfg.actor.hidden_dims = rl_cfg.critic.hidden_dims = (128, 64)
-    _reward_narrow_reach(env_cfg)
-    undo_contacts = simplify_contacts(env_cfg)
-
-    def undo(cfg: ManagerBasedRlEnvCfg) -> None:
-        undo_contacts(cfg)
-        cfg.rewards.pop(_NARROW_REACH, None)
-
-    rl_cfg.evaluation.prepare_env = undo
-    _learn_from_small_batches(rl_cfg)
-
-
-def _reward_narrow_reach(env_cfg: ManagerBasedRlEnvCfg) -> None:
+def _reward_narrow_reach(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> Undo:
     wide = env_cfg.rewards[_REACH]
     if wide is not None:
         params: dict[str, Any] = {**wide.params, "reaching_std": _NARROW_STD}
         env_cfg.rewards[_NARROW_REACH] = RewardTermCfg(
             func=wide.func, weight=wide.weight, params=params
         )
+    _evaluate(env_cfg, rl_cfg)
+
+    def undo(cfg: ManagerBasedRlEnvCfg) -> None:
+        cfg.rewards.pop(_NARROW_REACH, None)
+
+    return undo
 
 
-def cpu_vision(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
-    """Edit the configs of a task from images in place."""
-    # Encoders take most of the time, of the update above all.
-    env_cfg.scene.num_envs = 256
-    rl_cfg.actor.hidden_dims = rl_cfg.critic.hidden_dims = (128, 64)
-    _learn_from_small_batches(rl_cfg)
+def _evaluate_from_images(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
+    _evaluate(env_cfg, rl_cfg)
     # Of at most 3000.
     rl_cfg.evaluation.trigger_return = 1800.0
 
 
-def _learn_from_small_batches(rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
-    rl_cfg.algorithm.entropy_coef = 0.01
-    rl_cfg.algorithm.desired_kl = 0.03
-    rl_cfg.algorithm.gamma = 0.98
-    rl_cfg.num_steps_per_env = 16
-    rl_cfg.max_iterations = 6000
-    rl_cfg.save_interval = 200
+def _evaluate(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     evaluation = rl_cfg.evaluation
     evaluation.num_episodes = 256
     evaluation.min_interval = 150
     evaluation.solved_above = {"success_rate": 0.9}
+
+
+_SHARED: dict[str, Any] = {
+    "num_steps_per_env": 16,
+    "gamma": 0.98,
+    "max_iterations": 6000,
+    "save_interval": 200,
+}
+
+cpu = cpu_profile(_reward_narrow_reach, simple_contacts=True, **_SHARED)
+"""Profile of the task from the state."""
+
+# Encoders take most of the time, of the update above all.
+cpu_vision = cpu_profile(_evaluate_from_images, num_envs=256, **_SHARED)
+"""Profile of the tasks from images."""

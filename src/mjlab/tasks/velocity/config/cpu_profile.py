@@ -20,12 +20,11 @@ Evaluations, `play` and `evaluate` undo the first two: what they show is the tas
 from __future__ import annotations
 
 from mjlab.envs import ManagerBasedRlEnvCfg
-from mjlab.rl.config import RslRlOnPolicyRunnerCfg, gaussian_distribution
-from mjlab.tasks.easing import drop_easing, ease_pushes, ease_weight, undo_all
-from mjlab.tasks.simple_contacts import simplify_contacts
+from mjlab.rl.config import RslRlOnPolicyRunnerCfg
+from mjlab.tasks.cpu_profile import cpu_profile
+from mjlab.tasks.easing import ease_weight
 
 _AIR_TIME = "air_time"
-# By which samples become the steps that curricula count; more environments are eased for as many steps.
 _NUM_ENVS = 512
 _PENALTY_AT_FIRST = 0.02
 _AIR_TIME_AT_FIRST = 0.5
@@ -33,16 +32,15 @@ _EASED_SAMPLES = 6_000_000
 # Whoever drags the feet falls at each change of command.
 _LIFTING = ("foot_clearance", "foot_swing_height")
 _LIFTING_EASED_SAMPLES = 2_000_000
-_UNPUSHED_SAMPLES = 2_000_000
 
 
-def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
-    """Edit the configs of a velocity task in place."""
-    env_cfg.scene.num_envs = _NUM_ENVS
-    rl_cfg.evaluation.prepare_env = undo_all([drop_easing, simplify_contacts(env_cfg)])
-    _ease_rewards(env_cfg)
-    ease_pushes(env_cfg, _UNPUSHED_SAMPLES // _NUM_ENVS)
-    _learn_from_few_samples(rl_cfg)
+def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
+    for name, term in env_cfg.rewards.items():
+        if term is None or (term.weight >= 0 and name != _AIR_TIME):
+            continue
+        first = _AIR_TIME_AT_FIRST if name == _AIR_TIME else _PENALTY_AT_FIRST * term.weight
+        samples = _LIFTING_EASED_SAMPLES if name in _LIFTING else _EASED_SAMPLES
+        ease_weight(env_cfg, name, first, samples // _NUM_ENVS)
     evaluation = rl_cfg.evaluation
     evaluation.num_episodes = 200
     evaluation.trigger_return = 3600.0
@@ -50,25 +48,12 @@ def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     evaluation.solved_below = {"lin_vel_error": 0.25, "ang_vel_error": 0.35, "failure_rate": 0.05}
 
 
-def _ease_rewards(env_cfg: ManagerBasedRlEnvCfg) -> None:
-    for name, term in env_cfg.rewards.items():
-        if term is None or (term.weight >= 0 and name != _AIR_TIME):
-            continue
-        first = _AIR_TIME_AT_FIRST if name == _AIR_TIME else _PENALTY_AT_FIRST * term.weight
-        samples = _LIFTING_EASED_SAMPLES if name in _LIFTING else _EASED_SAMPLES
-        ease_weight(env_cfg, name, first, samples // _NUM_ENVS)
-
-
-def _learn_from_few_samples(rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
-    rl_cfg.actor.hidden_dims = rl_cfg.critic.hidden_dims = (128, 64)
-    rl_cfg.actor.distribution_cfg = gaussian_distribution(0.8)
-    rl_cfg.algorithm.entropy_coef = 0.01
-    rl_cfg.algorithm.desired_kl = 0.03
-    rl_cfg.algorithm.gamma = 0.97
-    rl_cfg.algorithm.symmetry_cfg = {
-        "data_augmentation_func": "mjlab.tasks.velocity.symmetry:mirror_left_right",
-        "use_data_augmentation": True,
-    }
-    rl_cfg.num_steps_per_env = 12
-    rl_cfg.max_iterations = 2000
-    rl_cfg.save_interval = 100
+cpu = cpu_profile(
+    _ease,
+    num_envs=_NUM_ENVS,
+    init_std=0.8,
+    simple_contacts=True,
+    unpushed_samples=2_000_000,
+    mirror="mjlab.tasks.velocity.symmetry:mirror_left_right",
+)
+"""Profile of the velocity tasks."""

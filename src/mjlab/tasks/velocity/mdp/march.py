@@ -51,8 +51,7 @@ class MarchAction(JointPositionAction):
         march_change: (N, action_dim) change of the march in the last step (rad).
     """
 
-    cfg: MarchActionCfg
-    _transient = {"_clock", "_offsets", "_swing"}
+    _transient = {"_clock", "_command_name", "_offsets", "_swing"}
 
     def __init__(self, cfg: MarchActionCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
@@ -62,7 +61,7 @@ class MarchAction(JointPositionAction):
                 f"{len(cfg.swing)}."
             )
         self._clock = require_gait_clock(env, cfg.command_name)
-        self._offsets = cfg.offsets
+        self._command_name, self._offsets = cfg.command_name, cfg.offsets
         self._swing = torch.zeros(len(cfg.swing), self.action_dim, device=self.device)
         for leg, table in enumerate(cfg.swing):
             ids, _, values = resolve_matching_names_values(table, self.target_names)
@@ -97,5 +96,5 @@ class MarchAction(JointPositionAction):
             "march_offsets": list(self._offsets),
             "march_frequency": self._clock.cfg.frequency,
             "march_fade_s": self._clock.cfg.fade_s,
-            "march_command": self.cfg.command_name,
+            "march_command": self._command_name,
         }
