@@ -102,14 +102,16 @@ def coarsen_physics(env_cfg: ManagerBasedRlEnvCfg, num_steps: int) -> Undo:
     return undo
 
 
-def replace_rewards(env_cfg: ManagerBasedRlEnvCfg, rewards: dict[str, RewardTermCfg]) -> Undo:
+def replace_rewards(
+    env_cfg: ManagerBasedRlEnvCfg, rewards: dict[str, RewardTermCfg | None]
+) -> Undo:
     """Reward these terms instead of the task's.
 
     Undone, the task's terms are there again, with the weights that flags have changed since, and None
     where flags have removed one.
     """
     before = dict(env_cfg.rewards)
-    weights = {name: term.weight for name, term in rewards.items()}
+    weights = {name: term.weight for name, term in rewards.items() if term is not None}
     env_cfg.rewards = dict(rewards)
 
     def undo(eased: ManagerBasedRlEnvCfg) -> None:
