@@ -12,11 +12,7 @@ from mjlab.utils.os import dump_yaml
 
 TASKS = [task for task in list_tasks() if "cpu" in list_profiles(task)]
 
-MARCHING = [
-    "Mjlab-Velocity-Flat-Unitree-G1",
-    "Mjlab-Velocity-Rough-Unitree-G1",
-    "Mjlab-Velocity-Flat-Unitree-Go1",
-]
+MARCHING = [f"Mjlab-Velocity-{terrain}-Unitree-G1" for terrain in ("Flat", "Rough")]
 
 
 def written(cfg, path):

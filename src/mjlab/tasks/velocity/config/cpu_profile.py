@@ -20,15 +20,12 @@ Evaluations, `play` and `evaluate` undo the first two: what they show is the tas
 from __future__ import annotations
 
 from mjlab.envs import ManagerBasedRlEnvCfg
-from mjlab.managers import ObservationTermCfg
 from mjlab.rl.config import RslRlOnPolicyRunnerCfg
 from mjlab.tasks.cpu_profile import cpu_profile
 from mjlab.tasks.easing import ease_weight
-from mjlab.tasks.velocity import mdp
 
 _AIR_TIME = "air_time"
-NUM_ENVS = 512
-"""Number of environments."""
+_NUM_ENVS = 512
 _PENALTY_AT_FIRST = 0.02
 _AIR_TIME_AT_FIRST = 0.5
 _EASED_SAMPLES = 6_000_000
@@ -37,31 +34,13 @@ _LIFTING = ("foot_clearance", "foot_swing_height")
 _LIFTING_EASED_SAMPLES = 2_000_000
 
 
-def ease_penalties(env_cfg: ManagerBasedRlEnvCfg) -> None:
-    """Let penalties grow to their weights, and a reward for feet in the air fade out."""
+def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     for name, term in env_cfg.rewards.items():
         if term is None or (term.weight >= 0 and name != _AIR_TIME):
             continue
         first = _AIR_TIME_AT_FIRST if name == _AIR_TIME else _PENALTY_AT_FIRST * term.weight
         samples = _LIFTING_EASED_SAMPLES if name in _LIFTING else _EASED_SAMPLES
-        ease_weight(env_cfg, name, first, samples // NUM_ENVS)
-
-
-def let_legs_march(
-    env_cfg: ManagerBasedRlEnvCfg, clock: mdp.GaitClockCommandCfg, march: mdp.MarchActionCfg
-) -> None:
-    """Let the legs march by a gait clock, and the policy see the clock."""
-    env_cfg.commands[march.command_name] = clock
-    for group in env_cfg.observations.values():
-        assert group is not None
-        group.terms[march.command_name] = ObservationTermCfg(
-            func=mdp.generated_commands, params={"command_name": march.command_name}
-        )
-    env_cfg.actions["joint_pos"] = march
-
-
-def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
-    ease_penalties(env_cfg)
+        ease_weight(env_cfg, name, first, samples // _NUM_ENVS)
     evaluation = rl_cfg.evaluation
     evaluation.num_episodes = 200
     evaluation.trigger_return = 3600.0
@@ -71,10 +50,10 @@ def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None
 
 cpu = cpu_profile(
     _ease,
-    num_envs=NUM_ENVS,
+    num_envs=_NUM_ENVS,
     init_std=0.8,
     simple_contacts=True,
     unpushed_samples=2_000_000,
     mirror="mjlab.tasks.velocity.symmetry:mirror_left_right",
 )
-"""Profile of the Go1 on rough ground, and of robots of one's own."""
+"""Profile of the velocity tasks."""

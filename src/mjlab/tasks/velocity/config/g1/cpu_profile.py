@@ -24,6 +24,7 @@ from mjlab.asset_zoo.robots.unitree_g1.g1_constants import FULL_COLLISION
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.envs import mdp as envs_mdp
 from mjlab.managers import (
+    ObservationTermCfg,
     RewardTermCfg,
     SceneEntityCfg,
     TerminationTermCfg,
@@ -44,11 +45,11 @@ from mjlab.tasks.easing import (
     undo_all,
 )
 from mjlab.tasks.velocity import mdp
-from mjlab.tasks.velocity.config.cpu_profile import let_legs_march
 
 _NUM_ENVS = 1024
 _SIDES = ("left", "right")
 _FEET = SceneEntityCfg("robot", site_names=("left_foot", "right_foot"))
+_CLOCK = "gait"
 _LINEAR = "linear"
 # Half a step lasts a third of a second, as long as a pendulum of the robot's height takes to fall by half.
 _STRIDES_PER_SECOND = 1.5
@@ -87,19 +88,7 @@ def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> RslRlB
     Solved means that it walks: four of five episodes last for 20 s, with the task's pushes.
     """
     env_cfg.scene.num_envs = _NUM_ENVS
-    let_legs_march(
-        env_cfg,
-        mdp.GaitClockCommandCfg(frequency=_STRIDES_PER_SECOND, starts=(0.0, 0.5), fade_s=0.5),
-        mdp.MarchActionCfg(
-            entity_name="robot",
-            actuator_names=(".*",),
-            scale=dict(_BOUNDS),
-            swing=tuple(
-                {f"{side}_{joint}_joint": angle for joint, angle in _SWING.items()}
-                for side in _SIDES
-            ),
-        ),
-    )
+    _march(env_cfg)
     undos = [
         drop_easing,
         coarsen_physics(env_cfg, num_steps=3),
@@ -120,6 +109,26 @@ def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> RslRlB
     cfg = _learner(rl_cfg)
     cfg.evaluation.prepare_env = undo_all(undos)
     return cfg
+
+
+def _march(env_cfg: ManagerBasedRlEnvCfg) -> None:
+    """Let the legs march, and the policy see the clock."""
+    env_cfg.commands[_CLOCK] = mdp.GaitClockCommandCfg(
+        frequency=_STRIDES_PER_SECOND, starts=(0.0, 0.5), fade_s=0.5
+    )
+    for group in env_cfg.observations.values():
+        assert group is not None
+        group.terms[_CLOCK] = ObservationTermCfg(
+            func=mdp.generated_commands, params={"command_name": _CLOCK}
+        )
+    env_cfg.actions["joint_pos"] = mdp.MarchActionCfg(
+        entity_name="robot",
+        actuator_names=(".*",),
+        scale=dict(_BOUNDS),
+        swing=tuple(
+            {f"{side}_{joint}_joint": angle for joint, angle in _SWING.items()} for side in _SIDES
+        ),
+    )
 
 
 def _collide_less(env_cfg: ManagerBasedRlEnvCfg) -> Undo:

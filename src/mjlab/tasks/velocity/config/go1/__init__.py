@@ -23,18 +23,13 @@ _ENV_CFGS = "mjlab.tasks.velocity.config.go1.env_cfgs"
 _RL_CFG = "mjlab.tasks.velocity.config.go1.rl_cfg"
 _RUNNER = "mjlab.tasks.velocity.rl"
 
-_PROFILES = {
-    "Flat": "mjlab.tasks.velocity.config.go1.cpu_profile:cpu",
-    "Rough": "mjlab.tasks.velocity.config.cpu_profile:cpu",
-}
-
-for _terrain, _profile in _PROFILES.items():
+for _terrain in ("Flat", "Rough"):
     register_mjlab_task(
         task_id=f"Mjlab-Velocity-{_terrain}-Unitree-Go1",
         env_cfg=f"{_ENV_CFGS}:unitree_go1_{_terrain.lower()}_env_cfg",
         rl_cfg=f"{_RL_CFG}:unitree_go1_ppo_runner_cfg",
         runner_cls=f"{_RUNNER}:VelocityOnPolicyRunner",
-        profiles={"cpu": _profile},
+        profiles={"cpu": "mjlab.tasks.velocity.config.cpu_profile:cpu"},
     )
 
 __getattr__ = lazy_names(
