@@ -46,12 +46,13 @@ from mjlab.scripts.reference import (  # noqa: E402
     Reference,
     RunRecord,
     SeedRecord,
+    end_of,
     read_run,
     reference_path,
     thinned,
     trained_seconds,
 )
-from mjlab.scripts.run_folder import checkpoints_in, read_run_info  # noqa: E402
+from mjlab.scripts.run_folder import checkpoints_in  # noqa: E402
 from mjlab.scripts.train_seeds import run_forwarding_signals  # noqa: E402
 from mjlab.tasks.registry import UnknownTaskError, list_profiles, list_tasks, require_task  # noqa: E402
 from mjlab.utils.processes import available_cores  # noqa: E402
@@ -154,7 +155,7 @@ def _train(reference: Reference, seed: int, commit: str, options: Options) -> Se
     _clear_unless_same(folder, {"commit": commit, "flags": reference.train_flags})
     run = _newest_run(folder)
     left = 60.0 * options.minutes - (trained_seconds(run) if run else 0.0)
-    if left > 0 and (run is None or read_run_info(run).get("ended") not in ENDED):
+    if left > 0 and (run is None or end_of(run) not in ENDED):
         command = [sys.executable, "-m", "mjlab.scripts.train", reference.task]
         command += [*reference.train_flags, "--agent.seed", str(seed), "--device", options.device]
         command += ["--log-root", str(folder)]
@@ -163,7 +164,7 @@ def _train(reference: Reference, seed: int, commit: str, options: Options) -> Se
         begin = time.monotonic()
         status, stopped = run_forwarding_signals(command, left)
         run = _newest_run(folder)
-        ended = None if run is None else read_run_info(run).get("ended")
+        ended = None if run is None else end_of(run)
         # A signal that went to the training process alone ends it with 0 as well.
         if stopped or (ended == "interrupted" and time.monotonic() - begin < left):
             return None

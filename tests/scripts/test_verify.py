@@ -202,6 +202,13 @@ def test_a_run_interrupted_before_its_first_evaluation_goes_on(verify):
     assert verify("--seed", "5", "--resume").status == 0
 
 
+def test_a_run_interrupted_in_its_last_iteration_has_finished(verify):
+    with stopped_after(ITERATIONS):
+        outcome = verify("--seed", "5")
+    assert outcome.status in (0, 1)
+    assert "Verdict" in outcome.out
+
+
 def no_seeds(reference: dict) -> None:
     del reference["seeds"][1:]
 

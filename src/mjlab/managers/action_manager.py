@@ -74,7 +74,7 @@ class ActionTerm(ManagerTermBase):
     def export_metadata(self) -> dict[str, list | str | float | torch.Tensor]:
         """Return what a deployment needs beside scale, offset and clip, for exported policies.
 
-        Keys begin with the kind of the term, such as `march_`. Tensors are (numbers,) or (rows, numbers).
+        Keys begin with the kind of the term, such as `march_`. Tensors are (rows, numbers).
         """
         return {}
 

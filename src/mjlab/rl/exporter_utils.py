@@ -21,6 +21,8 @@ more add keys of their own (`ActionTerm.export_metadata`), such as the march of 
 | march_swing | for each leg, angle s_i of each component in the middle of a swing (rad) |
 | march_offsets | offset o_i of each leg (strides) |
 | march_frequency, march_fade_s | strides per second (Hz), and seconds in which the amplitude A goes from 0 to 1 |
+| march_standing_threshold | commanded motion `|c_xy| + |c_z|` below which A falls to 0; 0: it never does |
+| march_starts | phases c at which the clock starts, with A = 0; empty: any |
 | march_command | name of the gait clock among the commands |
 
 To the target it adds, before `action_clip`, `A sum_i s_i max(0, sin(2 pi (c + o_i)))^2` with c the phase
@@ -244,7 +246,8 @@ def _action_metadata(env: ManagerBasedRlEnv) -> Metadata:
     further: Metadata = {}
     for term in terms.values():
         for key, value in term.export_metadata().items():
-            further[key] = _rows(value) if isinstance(value, torch.Tensor) else value
+            is_table = isinstance(value, torch.Tensor)
+            further[key] = [_numbers(row) for row in value] if is_table else value
     return {
         "action_scale": float(scales[0]) if single else components["scale"],
         "action_names": list(terms),
@@ -283,10 +286,6 @@ def _clip_per_component(term: Any) -> list[list[float]]:
 
 def _numbers(values: torch.Tensor) -> list[float]:
     return [_shortest(value) for value in values.flatten().tolist()]
-
-
-def _rows(values: torch.Tensor) -> list:
-    return _numbers(values) if values.ndim < 2 else [_numbers(row) for row in values]
 
 
 def _shortest(value: float) -> float:

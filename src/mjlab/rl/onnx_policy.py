@@ -47,7 +47,14 @@ _INTERFACE = (
     "step_dt",
 )
 # Files without these are of policies whose legs do not march.
-_MARCH = ("march_swing", "march_offsets", "march_frequency", "march_fade_s")
+_MARCH = (
+    "march_swing",
+    "march_offsets",
+    "march_frequency",
+    "march_fade_s",
+    "march_standing_threshold",
+    "march_starts",
+)
 _ACTIONS = "actions"
 _RELATIVE_TOLERANCE = 0.01
 _ABSOLUTE_TOLERANCE = 6e-4

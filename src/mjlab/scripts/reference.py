@@ -40,7 +40,7 @@ _POINTS = 60
 _DIGITS = 5
 # Points, equally spaced in samples, at which a curve is compared.
 _GRID = 101
-# Of the samples of the slowest seed, those after which a healthy seed has been solved at the latest.
+# Upper bound of `samples_limit`, in multiples of the slowest seed's samples.
 _PATIENCE = 4.0
 
 
@@ -136,7 +136,7 @@ class Reference:
         folder.mkdir(parents=True, exist_ok=True)
         path = reference_path(folder, self.task, self.kind)
         draft = path.with_suffix(".tmp")
-        # A line for each seed's curve would be unreadable too, and indenting it takes much room.
+        # Not indented: smaller, and not meant to be read.
         draft.write_text(json.dumps(_rounded(dataclasses.asdict(self))) + "\n")
         draft.replace(path)
         return path
@@ -204,7 +204,7 @@ def read_run(run_dir: Path) -> RunRecord:
     )
     last = max(seconds)
     return RunRecord(
-        ended=str(read_run_info(run_dir).get("ended")),
+        ended=str(end_of(run_dir)),
         iterations=last + 1,
         samples=(last + 1) * per_iteration,
         seconds=passed[last],
@@ -213,6 +213,18 @@ def read_run(run_dir: Path) -> RunRecord:
         figures={name: [evaluations[i][name] for i in evaluated] for name in sorted(names)},
         num_episodes=agent["evaluation"]["num_episodes"],
     )
+
+
+def end_of(run_dir: Path) -> str | None:
+    """Return why a run ended: `finished` too where Ctrl-C came in its last iteration; None if unknown."""
+    info = read_run_info(run_dir)
+    ended = info.get("ended")
+    if (
+        ended == "interrupted"
+        and info["iterations"] >= read_agent_params(run_dir)["max_iterations"]
+    ):
+        return "finished"
+    return ended
 
 
 def trained_seconds(run_dir: Path) -> float:
@@ -314,8 +326,8 @@ def _width(count: int, probability: float) -> float:
 class Comparison:
     """A run and the band of a reference, at P samples.
 
-    The way that is compared goes to the end of the shortest reference run: solved seeds would keep
-    their value after it, and a band of such values is narrower than seeds are.
+    Compared up to the end of the shortest reference run: later values are constant, so that their band
+    would be too narrow.
     """
 
     samples: np.ndarray
@@ -338,7 +350,7 @@ class Comparison:
 
     @property
     def ends_within(self) -> bool:
-        """True if the run was solved within `limit`, or without one, if the way ends in the band."""
+        """True if solved within `limit`; where that is None, if the last point is in the band."""
         if self.limit is None:
             return bool(self.within[-1])
         return self.solved_at is not None and self.solved_at <= self.limit

@@ -26,6 +26,7 @@ from mjlab.scripts.reference import (
     Reference,
     RunRecord,
     compare,
+    end_of,
     read_run,
     reference_path,
     referenced_tasks,
@@ -128,7 +129,7 @@ def _prepare(argv: list[str]) -> tuple[str, VerifyConfig, Reference, TrainConfig
     if cfg.resume:
         run_dir = _newest_run(task, cfg)
         train_flags += ["--agent.resume", "True", "--agent.load-run", re.escape(run_dir.name)]
-        done = run_dir if read_run_info(run_dir).get("ended") in ENDED else None
+        done = run_dir if end_of(run_dir) in ENDED else None
     return task, cfg, reference, parse_train_flags(task, train_flags, f"verify {task}"), done
 
 
@@ -235,7 +236,7 @@ def _command(argv: list[str]) -> None:
     try:
         run = read_run(run_dir)
     except NotEvaluatedError:
-        if read_run_info(run_dir).get("ended") in ENDED:
+        if end_of(run_dir) in ENDED:
             raise
         print("So far     no evaluation: the same command with --resume goes on.")
         raise KeyboardInterrupt from None

@@ -1,12 +1,12 @@
-"""Settings with which a task learns on a few cores, as a profile of any task, of a robot of one's own too.
+"""Profile factory for training on a few CPU cores: any task, stock or one's own.
 
     register_mjlab_task(..., profiles={"cpu": cpu_profile(simple_contacts=True)})
 
 A few cores step some ten thousand environments a second, a hundredth of a GPU. So batches and networks
 are small, a policy may change more in an iteration, and rewards far away count less. What else makes a
 task easier to learn depends on the task: contacts that are quicker to solve, longer physics steps,
-pushes that begin later, mirror images, and edits of the task's own. None of it makes the task easier to
-pass: evaluations, `evaluate` and `play` undo it.
+pushes that begin later, mirror images. None of it makes the task easier to pass: evaluations, `evaluate`
+and `play` undo it.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ _OF_SENSOR = {
     mujoco.mjtSensor.mjSENS_VELOCIMETER: DIRECTION,
     mujoco.mjtSensor.mjSENS_ACCELEROMETER: DIRECTION,
 }
-# At which marches are compared.
+# Number of phases at which marches are compared.
 _PHASES = 17
 # Metres, or parts of a unit vector, that rays and axes may be off.
 _TOLERANCE = 1e-4

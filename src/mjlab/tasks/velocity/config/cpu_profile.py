@@ -1,4 +1,4 @@
-"""The `cpu` profile: settings of the velocity tasks for a few cores.
+"""The `cpu` profile of velocity tasks: the Go1's, and for robots of one's own. The G1 has another.
 
 A few cores step some ten thousand environments a second, a hundredth of a GPU. Under the task's own
 settings a robot has not left its first idea by then, which is to stand still: trying to move costs

@@ -344,10 +344,11 @@ def root_near_feet(
 def feet_apart_l2(
     env: ManagerBasedRlEnv, distance: float, asset_cfg: SceneEntityCfg
 ) -> torch.Tensor:
-    """Squared shortfall (m^2) of what the left foot is to the left of the right one, to `distance`.
+    """Squared amount (m^2) by which the lateral distance of two feet is below `distance` (m).
 
-    A robot whose feet come closer trips over them. Sideways is y of the root's frame; feet are given
-    as `site_names`, the left one first.
+    A robot whose feet come closer trips over them. The distance is that of the left foot to the left of
+    the right one, along y of the root's frame. Feet are `site_names`, the left one first: in the model,
+    or with `preserve_order`.
     """
     data = env.scene[asset_cfg.name].data
     feet = data.site_pos_w[:, columns(asset_cfg.site_ids, env.device)]

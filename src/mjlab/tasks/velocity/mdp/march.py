@@ -26,7 +26,7 @@ class MarchActionCfg(JointPositionActionCfg):
     """Joint position targets `q0 + m + scale * action`, where m marches in place."""
 
     swing: tuple[dict[str, float], ...]
-    """For each leg, joint name pattern to what m is in the middle of a swing (rad); others 0."""
+    """Joint offsets in the middle of a swing (rad) by name pattern, one dict for each leg; others 0."""
     offsets: tuple[float, ...] = (0.0, 0.5)
     """Offset of each leg (strides), as in `feet_height_by_phase`."""
     command_name: str = "gait"
@@ -96,5 +96,9 @@ class MarchAction(JointPositionAction):
             "march_offsets": list(self._offsets),
             "march_frequency": self._clock.cfg.frequency,
             "march_fade_s": self._clock.cfg.fade_s,
+            "march_standing_threshold": self._clock.cfg.standing_threshold
+            if self._clock.cfg.velocity_command_name is not None
+            else 0.0,
+            "march_starts": list(self._clock.cfg.starts or ()),
             "march_command": self._command_name,
         }
