@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import hashlib
 import importlib.metadata
 import json
 import os
@@ -220,12 +221,16 @@ def _score(reference: Reference, run: Path, seed: int, options: Options) -> dict
 
 
 def code_commit() -> str:
-    """Return the last commit that changed the package, not its references."""
+    """Return the last commit that changed the package, not its references, and a hash of later changes."""
     code = ["--", "src", "pyproject.toml", ":!src/mjlab/reference"]
     git = ["git", "-C", str(ROOT)]
     commit = output_of([*git, "log", "-1", "--format=%h", *code]).strip()
-    is_changed = output_of([*git, "status", "--porcelain", *code]).strip()
-    return f"{commit} with changes" if is_changed else commit
+    changes = output_of([*git, "diff", "HEAD", *code])
+    new_files = output_of([*git, "ls-files", "--others", "--exclude-standard", *code]).splitlines()
+    changes += "".join((ROOT / name).read_text(errors="replace") for name in new_files)
+    if not changes:
+        return commit
+    return f"{commit} with changes {hashlib.sha256(changes.encode()).hexdigest()[:7]}"
 
 
 def versions() -> dict[str, str]:
