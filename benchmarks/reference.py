@@ -45,7 +45,6 @@ from mjlab.scripts.reference import (  # noqa: E402
     FIGURE,
     Kind,
     Reference,
-    RunRecord,
     SeedRecord,
     end_of,
     read_run,
@@ -394,7 +393,7 @@ def _words(name: str) -> str:
 def _draw(references: list[Reference], pages: Path) -> None:
     groups = {
         f"{reference.kind.upper()}, {len(reference.seeds)} seeds": [
-            _in_millions(seed.run) for seed in reference.seeds
+            seed.run.curve_in_millions() for seed in reference.seeds
         ]
         for reference in references
         if reference.seeds
@@ -407,11 +406,6 @@ def _draw(references: list[Reference], pages: Path) -> None:
         xlabel="Samples (millions)",
         ylabel="Mean evaluation return",
     )
-
-
-def _in_millions(run: RunRecord):
-    samples, values = run.curve()
-    return samples / 1e6, values
 
 
 def main() -> int:

@@ -76,6 +76,11 @@ class RunRecord:
 
         return np.array(self.samples_at, dtype=float), np.array(self.figures[name], dtype=float)
 
+    def curve_in_millions(self) -> Curve:
+        """Return millions of samples and mean returns of the evaluations, each (P,)."""
+        samples, values = self.curve()
+        return samples / 1e6, values
+
 
 @dataclass(frozen=True, kw_only=True)
 class SeedRecord:
@@ -133,12 +138,13 @@ class Reference:
 
     def save(self, folder: Path) -> Path:
         """Write the reference into `folder`, whole or not at all; return the file."""
-        folder.mkdir(parents=True, exist_ok=True)
+        # Imports torch, which `verify` does without until it trains.
+        from mjlab.rl.exporter_utils import write_atomically
+
         path = reference_path(folder, self.task, self.kind)
-        draft = path.with_suffix(".tmp")
         # Not indented: smaller, and not meant to be read.
-        draft.write_text(json.dumps(_rounded(dataclasses.asdict(self))) + "\n")
-        draft.replace(path)
+        text = json.dumps(_rounded(dataclasses.asdict(self))) + "\n"
+        write_atomically(path, text.encode())
         return path
 
     @classmethod

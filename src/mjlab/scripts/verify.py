@@ -37,7 +37,6 @@ from mjlab.scripts.run_folder import read_run_info, run_folders
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from mjlab.rl.plot import Curve
     from mjlab.scripts.train_run import TrainConfig
 
 _USAGE = task_usage(
@@ -196,22 +195,18 @@ def _machine(machine: dict) -> str:
 def _draw(reference: Reference, run: RunRecord, comparison: Comparison, output: Path) -> Path:
     from mjlab.rl.plot import plot_curves
 
-    def millions(record: RunRecord) -> Curve:
-        samples, values = record.curve()
-        return samples / 1e6, values
-
     def draw(axes: Axes) -> None:
         for sign, label in ((-1, "band of a new seed"), (1, None)):
             edge = comparison.mean + sign * comparison.half
             axes.plot(comparison.samples / 1e6, edge, "--", color="gray", lw=1, label=label)
-        axes.plot(*millions(run), color="tab:red", marker=".", label="this run")
+        axes.plot(*run.curve_in_millions(), color="tab:red", marker=".", label="this run")
         if comparison.limit is not None:
             axes.axvline(comparison.limit / 1e6, color="gray", ls=":", label="solved by here")
 
     return plot_curves(
         {
             f"reference, {len(reference.seeds)} seeds": [
-                millions(seed.run) for seed in reference.seeds
+                seed.run.curve_in_millions() for seed in reference.seeds
             ]
         },
         output,
