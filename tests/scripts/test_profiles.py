@@ -20,6 +20,8 @@ from mjlab.tasks import registry
 from mjlab.tasks.cpu_profile import cpu_profile
 
 PROFILED = "Test-Profiled"
+PLAIN = "Mjlab-Cartpole-Balance"
+"""A task without profiles."""
 
 
 def cpu(env_cfg, rl_cfg) -> None:
@@ -113,7 +115,7 @@ def test_a_profile_that_does_not_exist_is_told_with_those_that_do(run, tmp_path,
     outcome = run(script, PROFILED, "--profile", "gpu", "--log-root", str(tmp_path))
     assert outcome.status == 1
     assert "no profile 'gpu'; its profiles are: big, cpu." in outcome.message
-    outcome = run(script, TASK, "--profile", "cpu", "--log-root", str(tmp_path))
+    outcome = run(script, PLAIN, "--profile", "cpu", "--log-root", str(tmp_path))
     assert "it has none" in outcome.message
     assert not list(tmp_path.iterdir())
 
@@ -200,7 +202,7 @@ def test_on_a_cpu_the_profile_is_suggested_in_one_line(run, tmp_path):
         (PROFILED, "cpu", "cpu", 0),
         (PROFILED, "big", "cpu", 0),
         (PROFILED, None, "cuda:0", 0),
-        (TASK, None, "cpu", 0),
+        (PLAIN, None, "cpu", 0),
     ],
 )
 def test_a_profile_is_suggested_only_where_it_is_of_use(task, profile, device, lines, capsys):
@@ -220,8 +222,8 @@ def test_list_envs_shows_profiles_and_imports_no_torch(run):
     lines = run("list_envs").out.splitlines()
     (line,) = (line for line in lines if PROFILED in line)
     assert line.endswith("(profiles: big, cpu)")
-    (line,) = (line for line in lines if TASK in line)
-    assert line.endswith(TASK)
+    (line,) = (line for line in lines if PLAIN in line)
+    assert line.endswith(PLAIN)
     code = (
         "import sys\nfrom mjlab.scripts.list_envs import _command\n_command([])\n"
         "assert not {'torch', 'mujoco'} & set(sys.modules)"

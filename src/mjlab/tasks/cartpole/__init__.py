@@ -29,6 +29,7 @@ register_mjlab_task(
     task_id="Mjlab-Cartpole-Swingup",
     env_cfg=f"{_CFG}:cartpole_swingup_env_cfg",
     rl_cfg=f"{_CFG}:cartpole_ppo_runner_cfg",
+    profiles={"cpu": "mjlab.tasks.cartpole.cpu_profile:cpu"},
 )
 
 
