@@ -67,7 +67,10 @@ SEEDS = {"Mjlab-Cartpole-Swingup": 5}
 # long as ten iterations.
 _FLAGS = ["--num-envs", "512", "--agent.evaluation.min-interval", "6"]
 # Curves are to begin at the start, and not where training data hint that the task may be solved.
-_EVALUATIONS = ["--agent.evaluation.trigger-return", "-1e9"]
+_EVALUATIONS = [
+    *("--agent.evaluation.trigger-return", "-1e9"),
+    *("--agent.evaluation.first-iteration", "0"),
+]
 _LIBRARIES = ("mujoco", "torch", "rsl-rl-lib")
 _SETTINGS = "settings.json"
 

@@ -225,6 +225,15 @@ def test_training_stops_when_solved_and_evaluation_leaves_no_trace(make_runner, 
     assert_same_bits(everything(runner), expected)
 
 
+def test_no_evaluation_is_made_before_the_first_iteration_that_may_have_one(make_runner):
+    recorder = Recorder()
+    runner = make_runner(evaluation=solved_at(0.01, first_iteration=4))
+    runner.observers.append(recorder)
+    runner.learn(50)
+    assert min(event[1] for event in recorder.events if event[0] == "evaluation") == 4
+    assert runner.current_learning_iteration == 4
+
+
 def test_training_goes_on_when_told_so_and_when_not_solved(make_runner):
     on = make_runner(evaluation=solved_at(0.01, stop_when_solved=False))
     on.learn(3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -78,6 +79,13 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "pessimistic": True,
     },
     "fixed range": {"value_range": (-1.0, 5.0)},
+    # The fake environment's observation has as many numbers as there are actions.
+    "taught": {
+        "teacher": "actor",
+        "teacher_steps": 12,
+        "imitation": ((5, 1.0), (25, 0.0)),
+        "symmetry_cfg": MIRROR,
+    },
 }
 
 
@@ -157,6 +165,89 @@ def test_it_learns_to_stay_where_rewards_are():
     actions = runner.get_inference_policy()(observations)
     assert actions[0, 0] < -0.3
     assert actions[1, 1] > 0.3
+
+
+def test_a_policy_learns_what_its_teacher_shows():
+    torch.manual_seed(3)
+    runner = make_runner(
+        teacher="actor", imitation=((0, 100.0),), actor_learning_rate=3e-3, num_updates=8
+    )
+    runner.learn(60)
+    shown = TensorDict({"actor": torch.empty(50, 2).uniform_(-0.8, 0.8)}, [50])
+    distance = (runner.alg.get_policy()(shown) - shown["actor"]).abs().mean()
+    assert distance < 0.1
+
+
+class Shown(FakeEnv):
+    """An environment with one more observation, `shown`, which is the same everywhere."""
+
+    value = 2.0
+
+    def get_observations(self) -> dict[str, torch.Tensor]:
+        return super().get_observations() | {"shown": torch.full((self.num_envs, 2), self.value)}
+
+
+@pytest.mark.parametrize(
+    ("value", "imitation"),
+    [
+        # No action, whatever it weighs.
+        (2.0, ((0, 100.0),)),
+        (math.inf, ((0, 100.0),)),
+        # An action, whose weight is 0 before the first update, after 3 steps.
+        (0.5, ((0, 100.0), (2, 0.0))),
+    ],
+)
+def test_without_an_action_or_a_weight_a_teacher_changes_no_bit(monkeypatch, value, imitation):
+    monkeypatch.setattr(Shown, "value", value)
+    monkeypatch.setitem(globals(), "FakeEnv", Shown)
+    results = []
+    for changes in ({}, {"teacher": "shown", "imitation": imitation}):
+        torch.manual_seed(3)
+        runner = make_runner(**changes)
+        runner.learn(5)
+        results.append(runner.alg.save()["actor_state_dict"])
+    assert_same_bits(*results)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"teacher": "actor", "imitation": ((5, 1.0), (2, 0.0))}, "rising steps"),
+        ({"teacher": "actor", "imitation": ()}, "rising steps"),
+        ({"teacher_steps": 3}, "without a teacher"),
+        ({"imitation": ((0, 1.0),)}, "without a teacher"),
+    ],
+)
+def test_an_imitation_that_would_be_silently_another_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        make_runner(**changes)
+
+
+def test_the_teacher_acts_at_first_with_exploration():
+    runner = make_runner(teacher="actor", teacher_steps=3)
+    env, seen, shown = runner.env.unwrapped, [], []
+    step = env.step
+
+    def record(action: torch.Tensor) -> Any:
+        shown.append(env.position.clone())
+        seen.append(action.clone())
+        return step(action)
+
+    env.step = record
+    runner.learn(1)
+    near = [
+        (action - position).abs()[position.abs() < 0.9].mean().item()
+        for action, position in zip(seen, shown, strict=True)
+    ]
+    assert max(near[:3]) < 0.2 < min(near[3:])
+    assert min(near[:3]) > 0.0
+
+
+def test_a_teacher_that_shows_something_else_than_actions_is_refused():
+    for group, facts in (("critic", ("2 numbers", "'critic'", "(4,)")), ("none", ("'none'",))):
+        with pytest.raises(ValueError, match="SAC teacher") as caught:
+            make_runner(teacher=group)
+        assert all(fact in str(caught.value) for fact in facts)
 
 
 def test_the_exported_policy_acts_as_the_policy(tmp_path):

@@ -71,13 +71,6 @@ class ActionTerm(ManagerTermBase):
         """Write targets to the entity; called before physics substeps."""
         raise NotImplementedError(f"{self.name} must define apply_actions.")
 
-    def export_metadata(self) -> dict[str, list | str | float | torch.Tensor]:
-        """Return what a deployment needs beside scale, offset and clip, for exported policies.
-
-        Keys begin with the kind of the term, such as `march_`. Tensors are (rows, numbers).
-        """
-        return {}
-
 
 class ActionManager(BuiltTermsManager[ActionTerm]):
     """Splits the action among its terms and remembers the last three actions.

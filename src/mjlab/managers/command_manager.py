@@ -74,6 +74,14 @@ class CommandTerm(ManagerTermBase):
         """The current command, (num_envs, ...)."""
         raise NotImplementedError(f"{self.name} must define the property command.")
 
+    def export_metadata(self, name: str) -> dict[str, list | str | float]:
+        """Return metadata from which a deployment can generate the command; empty by default.
+
+        Args:
+            name: Name of the command.
+        """
+        return {}
+
     def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
         """Advance time, redraw commands whose time is over, and update.
 

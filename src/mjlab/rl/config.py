@@ -130,6 +130,14 @@ class RslRlSacAlgorithmCfg:
     mean_penalty: float = 0.01
     """Weight of the squared mean of each action, before tanh, in the loss of the policy. Keeps actions
     that matter little from drifting to their bounds."""
+    teacher: str | None = None
+    """Observation group with the action that a controller would take, (N, actions), such as that of
+    `stepping_action`; the policy imitates it. Values outside (-1, 1) leave an action free."""
+    teacher_steps: int = 0
+    """Environment steps at the start in which the controller acts, with the policy's exploration."""
+    imitation: tuple[tuple[int, float], ...] = ((0, 0.0),)
+    """Weight of the squared distance from the teacher's action in the loss of the policy: points
+    (environment step, weight), with lines between them."""
     noise_hold: int = 1
     """Most steps for which an environment keeps its exploration noise; 1 draws it at every step."""
     symmetry_cfg: dict[str, Any] | None = None
@@ -180,6 +188,8 @@ class EvaluationCfg:
     """Instead of `trigger_fraction`, the return of the training data to wait for."""
     min_interval: int = 3
     """Iterations from one evaluation to the next, at least."""
+    first_iteration: int = 0
+    """Iterations before the first evaluation, at least."""
     success_return: float | None = None
     """Return from which one episode is a success. None: `solved_return`."""
     success_func: Callable[[Any], Any] | None = None

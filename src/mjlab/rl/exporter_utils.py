@@ -13,20 +13,17 @@ first, in its order and layout; numbers have full precision, and more keys follo
 | observation_delay | lowest and highest lag of each term, in steps |
 | step_dt, physics_dt, decimation | control period (s), physics time step (s), their ratio |
 
-A term's target is `action * action_scale + action_offset`, clipped to `action_clip`. Terms that do
-more add keys of their own (`ActionTerm.export_metadata`), such as the march of `MarchAction`:
+A term's target is `action * action_scale + action_offset`, clipped to `action_clip`. Commands that a
+deployment generates itself, such as the gait clock, export their parameters (`CommandTerm.export_metadata`):
 
 | key | value |
 | --- | --- |
-| march_swing | for each leg, angle s_i of each component in the middle of a swing (rad) |
-| march_offsets | offset o_i of each leg (strides) |
-| march_frequency, march_fade_s | strides per second (Hz), and seconds in which the amplitude A goes from 0 to 1 |
-| march_standing_threshold | commanded motion `|c_xy| + |c_z|` below which A falls to 0; 0: it never does |
-| march_starts | phases c at which the clock starts, with A = 0; empty: any |
-| march_command | name of the gait clock among the commands |
+| clock_command | name of the gait clock among the commands |
+| clock_frequency, clock_fade_s | strides per second (Hz), and seconds in which the amplitude A goes from 0 to 1 |
+| clock_standing_threshold | commanded motion `|c_xy| + |c_z|` below which A falls to 0; 0: it never does |
+| clock_starts | phases c (strides) at which the clock starts; empty: any |
 
-To the target it adds, before `action_clip`, `A sum_i s_i max(0, sin(2 pi (c + o_i)))^2` with c the phase
-of the clock in strides, which the policy observes as (A sin(2 pi c), A cos(2 pi c)).
+The policy observes (A sin(2 pi c), A cos(2 pi c)).
 """
 
 from __future__ import annotations
@@ -138,6 +135,9 @@ def get_base_metadata(
     if entity is not None:
         metadata.update(_joint_metadata(env, entity))
     metadata["command_names"] = list(env.command_manager.active_terms)
+    for name in env.command_manager.active_terms:
+        if (term := env.command_manager.get_term(name)) is not None:
+            metadata.update(term.export_metadata(name))
     metadata.update(_observation_metadata(env, observation_groups))
     metadata.update(_action_metadata(env))
     metadata["step_dt"] = _shortest(env.step_dt)
@@ -243,11 +243,6 @@ def _action_metadata(env: ManagerBasedRlEnv) -> Metadata:
         components["clip"] += _clip_per_component(term)
     # One number where one number was configured, as mjlab 1.6 writes it.
     single = len(scales) == 1 and isinstance(scales[0], (int, float))
-    further: Metadata = {}
-    for term in terms.values():
-        for key, value in term.export_metadata().items():
-            is_table = isinstance(value, torch.Tensor)
-            further[key] = [_numbers(row) for row in value] if is_table else value
     return {
         "action_scale": float(scales[0]) if single else components["scale"],
         "action_names": list(terms),
@@ -257,7 +252,6 @@ def _action_metadata(env: ManagerBasedRlEnv) -> Metadata:
         "action_target_names": components["names"],
         "action_offset": components["offset"],
         "action_clip": components["clip"],
-        **further,
     }
 
 

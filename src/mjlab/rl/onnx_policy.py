@@ -46,15 +46,8 @@ _INTERFACE = (
     "default_joint_pos",
     "step_dt",
 )
-# Files without these are of policies whose legs do not march.
-_MARCH = (
-    "march_swing",
-    "march_offsets",
-    "march_frequency",
-    "march_fade_s",
-    "march_standing_threshold",
-    "march_starts",
-)
+# Files without these are of policies that see no gait clock.
+_CLOCK = ("clock_frequency", "clock_fade_s", "clock_standing_threshold", "clock_starts")
 _ACTIONS = "actions"
 _RELATIVE_TOLERANCE = 0.01
 _ABSOLUTE_TOLERANCE = 6e-4
@@ -156,7 +149,7 @@ class OnnxPolicy(torch.nn.Module):
         if not differences:
             wanted = metadata_texts(get_base_metadata(env, "", self._named_groups()))
             own = {key: self.metadata[key] for key in _INTERFACE if key in self.metadata}
-            own |= {key: self.metadata.get(key, "") for key in _MARCH}
+            own |= {key: self.metadata.get(key, "") for key in _CLOCK}
             differences = [
                 f"{key}: the policy has {value or 'none'}, the environment {wanted.get(key) or 'none'}"
                 for key, value in own.items()

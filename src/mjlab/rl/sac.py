@@ -14,9 +14,11 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -72,6 +74,9 @@ class SAC:
         mean_penalty: float,
         noise_hold: int,
         scales_rewards: bool,
+        teacher: str | None = None,
+        teacher_steps: int = 0,
+        imitation: Sequence[tuple[int, float]] = ((0, 0.0),),
         mirror: Any = None,
         env: Any = None,
         use_mixed_precision: bool = False,
@@ -111,6 +116,16 @@ class SAC:
             groups, betas=(0.9, 0.95), weight_decay=weight_decay, fused=True
         )
         self.learning_rate = actor_learning_rate
+        steps = [step for step, _ in imitation]
+        if not steps or steps != sorted(set(steps)):
+            raise ValueError(f"SAC imitation: expected points with rising steps, got {imitation}.")
+        if teacher is None and (teacher_steps > 0 or any(weight for _, weight in imitation)):
+            raise ValueError(
+                "SAC teacher_steps, imitation: expected 0 without a teacher; set teacher to the group of "
+                "observations that shows its actions."
+            )
+        self._teacher, self._teacher_steps = teacher, teacher_steps
+        self._imitation_steps, self._imitation_weights = zip(*imitation, strict=True)
         self._mirror, self._env = mirror, env
         self._use_mixed_precision = use_mixed_precision
         self._multi_gpu, self._bucket_mb = multi_gpu_cfg, grad_reduce_bucket_mb
@@ -144,7 +159,12 @@ class SAC:
             self._started = True
         distribution = _of(self._policy)
         distribution.update(self._policy.mlp(self._policy.get_latent(obs)))
-        self._actions = distribution.action_of(self._noise.draw())
+        noise = self._noise.draw()
+        self._actions = distribution.action_of(noise)
+        if self._teacher is not None and self._num_steps < self._teacher_steps:
+            shown = obs[self._teacher]
+            near = torch.tanh(torch.atanh(shown) + distribution.std * noise)
+            self._actions = torch.where(_has_opinion(shown), near, self._actions)
         return self._actions
 
     def process_env_step(
@@ -231,7 +251,9 @@ class SAC:
                 value.repeat(2) for value in (returns, discounts, weights)
             )
         with torch.no_grad():
+            taught = {} if self._teacher is None else {"teacher": before[self._teacher]}
             return {
+                **taught,
                 "actor": self.actor.get_latent(before),
                 "critic": self.critic.get_latent(before),
                 "next_actor": self.actor.get_latent(after),
@@ -293,12 +315,21 @@ class SAC:
         # Of actions that are seldom tried, critics know least. Without this, those of joints that
         # matter little drift to their bounds, where tanh has no gradient that would lead back.
         loss = loss + self._mean_penalty * distribution.params[0].square().sum(dim=-1).mean()
+        figures = {}
+        if "teacher" in inputs:
+            # On states that the policy itself leads to (DAgger; Ross et al., arXiv 1011.0686).
+            shown = inputs["teacher"]
+            difference = torch.where(_has_opinion(shown), distribution.mean - shown, 0.0)
+            distance = difference.square().sum(dim=-1).mean()
+            weight = np.interp(self._num_steps, self._imitation_steps, self._imitation_weights)
+            loss = loss + float(weight) * distance
+            figures["imitation"] = distance.detach()
         entropy = distribution.entropy.detach().mean()
         alpha_loss = self._log_alpha.exp() * (entropy - self._target_entropy)
         # Not for the critic, whose gradients are those of its own loss.
         loss.backward(inputs=list(self.actor.parameters()))
         alpha_loss.backward()
-        return {
+        return figures | {
             "actor": loss.detach(),
             "entropy": entropy,
             "alpha": self._log_alpha.detach().exp(),
@@ -415,6 +446,14 @@ class SAC:
             **critic_cfg,
         )
         groups = list(dict.fromkeys([*actor.obs_groups, *critic.obs_groups]))
+        if (teacher := alg_cfg["teacher"]) is not None:
+            shape = tuple(obs[teacher].shape[1:]) if teacher in obs else None
+            if shape != (env.num_actions,):
+                raise ValueError(
+                    f"SAC teacher: expected an observation group of {env.num_actions} numbers, one for "
+                    f"each action, got {teacher!r}, of shape {shape}; groups are {sorted(obs.keys())}."
+                )
+            groups.append(teacher)
         steps = alg_cfg.pop("replay_steps")
         storage = ReplayStorage(steps, obs.to(device), groups, env.num_actions)
         symmetry = alg_cfg.pop("symmetry_cfg")
@@ -505,6 +544,11 @@ class _ReturnScale:
             own = getattr(self, name)
             if value.shape == own.shape:
                 setattr(self, name, value.to(own.device).clone())
+
+
+def _has_opinion(shown: torch.Tensor) -> torch.Tensor:
+    """Return which actions a teacher shows, (N, A): those within the range of actions."""
+    return shown.abs() < 1.0
 
 
 def _of(model: SacActorModel) -> SquashedGaussian:

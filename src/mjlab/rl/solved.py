@@ -49,7 +49,10 @@ class SolvedCheck:
 
     def is_due(self, stats: IterationStats) -> bool:
         """Return whether the training data hint that the policy may be good enough."""
-        if not self._has_target or stats.iteration - self.last_iteration < self._min_interval:
+        since = stats.iteration - self.last_iteration
+        if not self._has_target or since < self._min_interval:
+            return False
+        if stats.iteration < self._cfg.get("first_iteration", 0):
             return False
         trigger = self._cfg.get("trigger_return")
         if trigger is None:

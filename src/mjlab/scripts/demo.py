@@ -1,7 +1,8 @@
-"""Watch the policy that comes with the package: `uv run demo`."""
+"""Watch a policy that comes with the package: `uv run demo`, `uv run demo g1`."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,36 +11,51 @@ from mjlab.scripts.cli import UserError, parse_flags, run_command
 if TYPE_CHECKING:
     from mjlab.scripts.play_run import PlayConfig
 
-TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
-"""The task that the policy was trained for."""
-POLICY = Path(__file__).parents[1] / "demo" / "go1_velocity.onnx"
-"""The policy; the README beside it says how it was made."""
+_FOLDER = Path(__file__).parents[1] / "demo"
 
-_USAGE = f"""usage: demo [flags]
 
-Play a Unitree Go1 that walks as told, in the browser and offline. Flags are those of `play`:
+@dataclass(frozen=True)
+class Demo:
+    """A policy that comes with the package; the README beside it says how it was made."""
+
+    task: str
+    """The task that it was trained for."""
+    profile: str | None
+    """The profile of the task that its observations and actions are of."""
+    policy: Path
+    """The exported policy."""
+
+
+DEMOS = {
+    "go1": Demo("Mjlab-Velocity-Flat-Unitree-Go1", None, _FOLDER / "go1_velocity.onnx"),
+    "g1": Demo("Mjlab-Velocity-Flat-Unitree-G1", "cpu", _FOLDER / "g1_velocity.onnx"),
+}
+
+_USAGE = """usage: demo [go1|g1] [flags]
+
+Play a robot that walks as told, in the browser and offline: a Unitree Go1 (quadruped, also without a name)
+or G1 (humanoid). Flags are those of `play`:
 
     uv run demo
+    uv run demo g1
     uv run demo --num-envs 4 --port 8090
-    uv run demo --viewer none --video True
-
-It plays {TASK}."""
+    uv run demo g1 --viewer none --video True"""
 
 
-def demo_cfg() -> PlayConfig:
+def demo_cfg(demo: Demo) -> PlayConfig:
     """Return what `demo` plays unless flags say otherwise: one robot, on the CPU, in the browser."""
     from mjlab.scripts.play_run import PlayConfig
     from mjlab.scripts.policy import policy_env_cfg
     from mjlab.sensor import RayCastSensorCfg
 
-    env = policy_env_cfg(TASK, None, purpose="play")
+    env = policy_env_cfg(demo.task, demo.profile, purpose="play")
     for sensor in env.scene.sensors:
         # A first look is at the robot, not at what its sensors see.
         if isinstance(sensor, RayCastSensorCfg):
             sensor.debug_vis = False
     return PlayConfig(
         env=env,
-        checkpoint_file=str(POLICY),
+        checkpoint_file=str(demo.policy),
         num_envs=1,
         device="cpu",
         viewer="viser",
@@ -47,7 +63,7 @@ def demo_cfg() -> PlayConfig:
     )
 
 
-def run_demo(cfg: PlayConfig) -> None:
+def run_demo(demo: Demo, cfg: PlayConfig) -> None:
     """Play `cfg`.
 
     Raises:
@@ -55,12 +71,13 @@ def run_demo(cfg: PlayConfig) -> None:
     """
     from mjlab.scripts.play_run import run_play
 
-    if cfg.agent == "trained" and cfg.checkpoint_file == str(POLICY) and not POLICY.is_file():
+    plays_its_own = cfg.agent == "trained" and cfg.checkpoint_file == str(demo.policy)
+    if plays_its_own and not demo.policy.is_file():
         raise UserError(
-            f"The demo has no policy of its own yet: there is no {POLICY}. Name a policy of {TASK} "
-            "with --checkpoint-file FILE.onnx; `train` leaves one in the folder of every run."
+            f"The demo's policy {demo.policy} does not exist. Name a policy of {demo.task} with "
+            "--checkpoint-file FILE.onnx; `train` leaves one in the folder of every run."
         )
-    run_play(TASK, cfg)
+    run_play(demo.task, cfg)
 
 
 def _command(argv: list[str]) -> None:
@@ -69,7 +86,11 @@ def _command(argv: list[str]) -> None:
         return
     from mjlab.scripts.play_run import PlayConfig
 
-    run_demo(parse_flags(PlayConfig, demo_cfg(), argv, prog="demo"))
+    name, flags = ("go1", argv) if not argv or argv[0].startswith("-") else (argv[0], argv[1:])
+    if name not in DEMOS:
+        raise UserError(f"demo: expected one of {', '.join(DEMOS)}, got {name!r}.")
+    demo = DEMOS[name]
+    run_demo(demo, parse_flags(PlayConfig, demo_cfg(demo), flags, prog=f"demo {name}"))
 
 
 def main() -> None:

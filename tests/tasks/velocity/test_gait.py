@@ -176,107 +176,39 @@ def test_a_clock_that_cannot_run_is_refused_when_built(make_env, changes, messag
         make_env(edit=edit)
 
 
-def march_cfg(task: str, joints: dict[str, float]):
-    """Return an edit that adds a march with these joints of each leg, named without the leg."""
-    legs = {G1: ("left", "right"), GO1: ("FR", "FL", "RR", "RL")}[task]
-
+def test_a_deployment_can_run_the_clock_from_the_metadata_of_the_policy(make_env):
     def edit(cfg: Any) -> None:
-        cfg.actions["joint_pos"] = mdp.MarchActionCfg(
-            entity_name="robot",
-            actuator_names=(".*",),
-            scale=0.3,
-            offsets=OFFSETS[task],
-            swing=tuple({f"{leg}_{j}_joint": v for j, v in joints.items()} for leg in legs),
+        cfg.commands["gait"] = mdp.GaitClockCommandCfg(
+            frequency=1.7, starts=(0.25,), fade_s=0.1, velocity_command_name=None
         )
 
-    return edit
-
-
-@pytest.mark.parametrize(
-    ("task", "joints"),
-    [(G1, {"hip_pitch": -0.4, "knee": 0.7}), (GO1, {"thigh": 0.2, "calf": -0.5})],
-)
-def test_a_march_moves_the_legs_whose_feet_are_to_swing_by_what_it_says(make_env, task, joints):
-    env = make_env(task, num_envs=8, edit=march_cfg(task, joints))
-    robot = env.scene["robot"]
-    action = 2.0 * torch.rand(8, env.action_manager.total_action_dim) - 1.0
-    expected = robot.data.default_joint_pos + 0.3 * action
-    swing = clock(env).swing(OFFSETS[task])
-    for i, leg in enumerate({G1: ("left", "right"), GO1: ("FR", "FL", "RR", "RL")}[task]):
-        for joint, value in joints.items():
-            expected[:, robot.joint_names.index(f"{leg}_{joint}_joint")] += value * swing[:, i]
-    env.action_manager.process_action(action)
-    env.action_manager.apply_action()
-    target = robot.data.joint_pos_target + robot.data.encoder_bias
-    torch.testing.assert_close(target, expected)
-    # Opposite feet swing in turn.
-    assert (swing[:, 0] * swing[:, 1] == 0.0).all()
-
-
-def test_the_mirror_image_of_a_march_is_the_march_half_a_stride_later(make_env):
-    def edit(cfg: Any) -> None:
-        march_cfg(G1, {"hip_pitch": -0.4, "knee": 0.7, "ankle_pitch": -0.3})(cfg)
-        cfg.commands["gait"].velocity_command_name = None
-
     env = make_env(G1, edit=edit)
-    clock(env).cycles[:] = torch.tensor([0.1, 0.6, 0.3, 0.8])
-    env.action_manager.process_action(no_action(env))
-    env.action_manager.apply_action()
-    data = env.scene["robot"].data
-    moved = data.joint_pos_target + data.encoder_bias - data.default_joint_pos
-    assert moved.abs().amax() > 0.1
-    _, images = mirror_left_right(env=env, obs=None, actions=moved)
-    torch.testing.assert_close(images[4:], moved[[1, 0, 3, 2]])
-
-
-def test_a_deployment_has_the_march_from_the_metadata_of_the_policy(make_env):
-    def edit(cfg: Any) -> None:
-        march_cfg(G1, {"hip_pitch": -0.4, "knee": 0.7})(cfg)
-        cfg.commands["gait"].velocity_command_name = None
-
-    env = make_env(G1, num_envs=8, edit=edit)
-    action = 2.0 * torch.rand(8, env.action_manager.total_action_dim) - 1.0
-    env.action_manager.process_action(action)
-    env.action_manager.apply_action()
-    robot = env.scene["robot"].data
     told = metadata_texts(get_base_metadata(env, "local"))
-
-    def numbers(key: str) -> torch.Tensor:
-        rows = [[float(v) for v in row.split(";")] for row in told[key].split(",")]
-        return torch.tensor(rows)
-
-    # What the policy sees of the clock: (A sin 2 pi c, A cos 2 pi c).
-    sine, cosine = env.command_manager.get_command(told["march_command"]).T
-    offsets, amplitude = numbers("march_offsets").T, torch.hypot(sine, cosine)
-    cycles = torch.atan2(sine, cosine)[:, None] / (2.0 * math.pi)
-    lifted = torch.sin(2.0 * math.pi * (cycles + offsets)).clamp(min=0.0).square()
-    march = amplitude[:, None] * (lifted @ numbers("march_swing"))
-    assert march.abs().amax() > 0.1
-    scale = float(told["action_scale"])
-    expected = action * scale + numbers("action_offset").T + march
-    torch.testing.assert_close(robot.joint_pos_target + robot.encoder_bias, expected)
-
-
-def test_a_policy_that_marches_is_refused_where_legs_do_not_and_the_other_way_round(
-    make_env, tmp_path
-):
-    plain, marching = (
-        make_env(G1, edit=edit) for edit in (scale_actions, march_cfg(G1, {"knee": 0.7}))
+    env.reset()
+    for _ in range(7):
+        env.step(no_action(env))
+    time = 7 * float(told["step_dt"])
+    cycles = float(told["clock_starts"]) + float(told["clock_frequency"]) * time
+    amplitude = min(1.0, time / float(told["clock_fade_s"]))
+    expected = [
+        amplitude * math.sin(2 * math.pi * cycles),
+        amplitude * math.cos(2 * math.pi * cycles),
+    ]
+    assert env.command_manager.get_command(told["clock_command"])[0].tolist() == pytest.approx(
+        expected, abs=1e-5
     )
-    policies = []
-    for env in (plain, marching):
-        path = tmp_path / f"{len(policies)}.onnx"
-        export(env, path)
-        policies.append(OnnxPolicy(path))
-        policies[-1].check_fits(env)
-    for policy, env in ((policies[0], marching), (policies[1], plain)):
-        with pytest.raises(OnnxPolicyError, match="march_swing: the policy has"):
-            policy.check_fits(env)
 
 
-def scale_actions(cfg: Any) -> None:
-    """Give actions the scale that they have with `march_cfg`."""
-    cfg.actions["joint_pos"].scale = 0.3
+def test_a_policy_is_refused_where_the_clock_is_another(make_env, tmp_path):
+    def faster(cfg: Any) -> None:
+        cfg.commands["gait"].frequency *= 1.5
+
+    own, other = make_env(G1), make_env(G1, edit=faster)
+    path = tmp_path / "policy.onnx"
+    export(own, path)
+    OnnxPolicy(path).check_fits(own)
+    with pytest.raises(OnnxPolicyError, match="clock_frequency: the policy has"):
+        OnnxPolicy(path).check_fits(other)
 
 
 def export(env: ManagerBasedRlEnv, path: Path) -> None:
@@ -290,37 +222,6 @@ def export(env: ManagerBasedRlEnv, path: Path) -> None:
         input_names=["obs"], output_names=["actions"],
     )  # fmt: skip
     attach_metadata_to_onnx(str(path), get_base_metadata(env, "local"))
-
-
-@pytest.mark.parametrize(
-    ("swing", "offsets"),
-    [
-        (({"left_knee_joint": 0.7}, {"right_knee_joint": 0.5}), (0.0, 0.5)),
-        (({"left_knee_joint": 0.7}, {"right_knee_joint": 0.7}), (0.0, 0.4)),
-    ],
-)
-def test_a_march_with_another_stride_of_the_left_leg_has_no_mirror(make_env, swing, offsets):
-    def edit(cfg: Any) -> None:
-        march_cfg(G1, {})(cfg)
-        cfg.actions["joint_pos"].swing, cfg.actions["joint_pos"].offsets = swing, offsets
-
-    env = make_env(G1, edit=edit)
-    with pytest.raises(ValueError, match="swing is not the same on the left"):
-        mirror_left_right(env=env, actions=no_action(env))
-
-
-def test_a_march_that_does_not_fit_is_refused_when_built(make_env):
-    def edit(cfg: Any, **changes: Any) -> None:
-        march_cfg(G1, {"knee": 0.7})(cfg)
-        for name, value in changes.items():
-            setattr(cfg.actions["joint_pos"], name, value)
-
-    with pytest.raises(ValueError, match="expected one dict for each of the 3 offsets, got 2"):
-        make_env(edit=lambda cfg: edit(cfg, offsets=(0.0, 0.3, 0.6)))
-    with pytest.raises(ValueError, match="expected a GaitClockCommand"):
-        make_env(edit=lambda cfg: edit(cfg, command_name="twist"))
-    with pytest.raises(ValueError, match="elbows"):
-        make_env(edit=lambda cfg: edit(cfg, swing=({"elbows": 1.0}, {})))
 
 
 def feet_cfg(env: ManagerBasedRlEnv) -> SceneEntityCfg:
@@ -584,16 +485,6 @@ def test_gait_metrics_agree_with_what_they_are_made_of(make_env):
     slip = values["foot_slip"]
     assert (slip >= torch.where(touches, slowest, 0.0) - 1e-6).all()
     assert (slip <= fastest + 1e-6).all()
-
-
-def test_the_action_rate_is_that_of_the_targets_of_a_march(make_env):
-    env = make_env(G1, edit=march_cfg(G1, {"knee": 0.7, "hip_pitch": -0.4}))
-    term: Any = env.action_manager.get_term("joint_pos")
-    for _ in range(3):
-        before = term._processed_actions.clone()
-        env.step(torch.rand_like(no_action(env)))
-    change = (term._processed_actions - before).abs().mean(dim=1)
-    torch.testing.assert_close(GAIT_FIGURES["action_rate"](env), change)
 
 
 def test_the_action_rate_does_not_depend_on_the_scale_of_actions(make_env):

@@ -13,7 +13,6 @@ import torch
 from mjlab.envs.mdp._checks import require_sensor
 from mjlab.envs.mdp._indexing import columns
 from mjlab.sensor import TerrainHeightSensor
-from mjlab.tasks.velocity.mdp.march import MarchAction
 from mjlab.tasks.velocity.mdp.sensor_checks import (
     check_feet_sensor,
     check_same_feet,
@@ -59,14 +58,13 @@ def mechanical_power(env: Any) -> torch.Tensor:
 def action_rate(env: Any) -> torch.Tensor:
     """Return the mean over actions of |a_t - a_(t-1)| times their scale, (num_envs,).
 
-    For joint positions that is the change of the target in a step, in rad, before any clip; a march
-    counts.
+    For joint positions that is the change of the target in a step, in rad, before any clip.
     """
     manager = env.action_manager
     terms = [manager.get_term(name) for name in manager.active_terms]
     sizes = [term.action_dim for term in terms]
     changes = [
-        change * term.scale + (term.march_change if isinstance(term, MarchAction) else 0.0)
+        change * term.scale
         for change, term in zip(
             (manager.action - manager.prev_action).split(sizes, dim=1), terms, strict=True
         )

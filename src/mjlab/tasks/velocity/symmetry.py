@@ -44,8 +44,6 @@ _OF_SENSOR = {
     mujoco.mjtSensor.mjSENS_VELOCIMETER: DIRECTION,
     mujoco.mjtSensor.mjSENS_ACCELEROMETER: DIRECTION,
 }
-# Number of phases at which marches are compared.
-_PHASES = 17
 # Metres, or parts of a unit vector, that rays and axes may be off.
 _TOLERANCE = 1e-4
 
@@ -132,13 +130,18 @@ def _mirror_of_term(
             f"{label} has scale {cfg.scale!r} and clip {clip!r}; mirror_left_right takes one number "
             f"as scale, and a clip that is the same on both sides of 0. {WITHOUT}"
         )
-    mirror = kind(env, cfg.params)
+    mirror = Mirror.joined([kind(env, cfg.params)] * _num_instants(env, group, name))
     if shape != (len(mirror),):
         raise ValueError(
             f"{label} has shape {shape} for each environment, and mirror_left_right expects "
-            f"({len(mirror)},): the latest value, of everything that the term measures. {WITHOUT}"
+            f"({len(mirror)},): everything that the term measures, with any history flattened. {WITHOUT}"
         )
     return mirror
+
+
+def _num_instants(env: ManagerBasedRlEnv, group: str, name: str) -> int:
+    """Return the number of steps whose values a term shows, one behind the other."""
+    return max(1, env.observation_manager.get_term_cfg(group, name).history_length)
 
 
 def _direction(*_: Any) -> Mirror:
@@ -230,6 +233,7 @@ def _lever_arms(env: ManagerBasedRlEnv, group: str, starts: dict[str, int]) -> l
     """
     configs: Any = env.cfg.observations
     terms = {name: configs[group].terms[name] for name in starts}
+    instants = {name: _num_instants(env, group, name) for name in starts}
     sensors = {
         name: _sensor(env, cfg.params["sensor_name"])
         for name, cfg in terms.items()
@@ -249,21 +253,25 @@ def _lever_arms(env: ManagerBasedRlEnv, group: str, starts: dict[str, int]) -> l
                 for other, body in turning.items()
                 if body == sensor.body
                 and _factor(terms[other]) != 0.0
-                and _same_instant(terms[name], terms[other])
+                and instants[other] == instants[name]
+                and _same_lag(terms[name], terms[other])
             ),
             None,
         )
         if gyro is not None:
             factor = 2.0 * sensor.y * _factor(terms[name]) / _factor(terms[gyro])
-            x, _, z = range(starts[name], starts[name] + 3)
-            turn_x, _, turn_z = range(starts[gyro], starts[gyro] + 3)
-            couplings += [Coupling(x, turn_z, factor), Coupling(z, turn_x, -factor)]
+            for instant in range(instants[name]):
+                x, _, z = range(starts[name] + 3 * instant, starts[name] + 3 * instant + 3)
+                turn_x, _, turn_z = range(
+                    starts[gyro] + 3 * instant, starts[gyro] + 3 * instant + 3
+                )
+                couplings += [Coupling(x, turn_z, factor), Coupling(z, turn_x, -factor)]
         elif abs(sensor.y) > PLACE_TOLERANCE:
             raise ValueError(
                 f"The observation {group}/{name} is the velocity of a point {sensor.y:.3g} m to the "
                 "left of the middle. Its mirror image depends on the angular velocity of "
                 f"{env.sim.mj_model.body(sensor.body).name!r}; observe that in group {group!r} too, "
-                f"without delay or with the same fixed one, or use base_lin_vel. {WITHOUT}"
+                f"with the same history_length, and without delay or with the same fixed one, or use base_lin_vel. {WITHOUT}"
             )
     return couplings
 
@@ -273,8 +281,8 @@ def _factor(cfg: Any) -> float:
     return 1.0 if cfg.scale is None else float(cfg.scale)
 
 
-def _same_instant(one: Any, other: Any) -> bool:
-    """Return whether two terms always show values of the same time."""
+def _same_lag(one: Any, other: Any) -> bool:
+    """Return whether two terms are always delayed by the same time."""
     lags = {one.delay_min_lag, one.delay_max_lag, other.delay_min_lag, other.delay_max_lag}
     return len(lags) == 1
 
@@ -321,16 +329,7 @@ def _of_actions(env: ManagerBasedRlEnv, params: dict[str, Any] | None = None) ->
     scale = torch.as_tensor(term.scale, dtype=torch.float32).expand(env.num_envs, len(driven))
     if not torch.allclose(scale[:, sources], scale):
         raise ValueError(f"The actions have another scale on the left than on the right. {WITHOUT}")
-    mirror = Mirror(sources, joints.signs[driven].tolist())
-    if isinstance(term, mdp.MarchAction):
-        cycles = torch.linspace(0.0, 1.0, _PHASES, device=env.device)
-        image = mirror(term.march_at(cycles))
-        if not torch.allclose(image, term.march_at(cycles + 0.5), atol=1e-5):
-            raise ValueError(
-                "The march's swing is not the same on the left, half a stride later, as on the right; "
-                f"use the same angles for both, and offsets that are 0.5 apart. {WITHOUT}"
-            )
-    return mirror
+    return Mirror(sources, joints.signs[driven].tolist())
 
 
 def _of_feet(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
@@ -384,6 +383,7 @@ _KINDS: dict[Any, Callable[..., Mirror]] = {
     envs_mdp.joint_pos_rel: _of_joints,
     envs_mdp.joint_vel_rel: _of_joints,
     envs_mdp.last_action: _of_actions,
+    mdp.stepping_action: _of_actions,
     envs_mdp.generated_commands: _of_command,
     envs_mdp.height_scan: _of_rays,
     mdp.foot_height: _of_feet,

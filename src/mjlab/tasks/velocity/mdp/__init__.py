@@ -17,7 +17,6 @@ from mjlab.tasks.velocity.mdp.gait import (
     root_near_feet,
     weighted_joint_deviation,
 )
-from mjlab.tasks.velocity.mdp.march import MarchAction, MarchActionCfg
 from mjlab.tasks.velocity.mdp.observations import (
     foot_air_time,
     foot_contact,
@@ -38,6 +37,7 @@ from mjlab.tasks.velocity.mdp.rewards import (
     upright,
     variable_posture,
 )
+from mjlab.tasks.velocity.mdp.stepping import SteppingGains, stepping_action
 from mjlab.tasks.velocity.mdp.terminations import (
     illegal_contact,
     out_of_terrain_bounds,
@@ -55,9 +55,8 @@ __all__ = [
     "ContactSensor",
     "GaitClockCommand",
     "GaitClockCommandCfg",
-    "MarchAction",
-    "MarchActionCfg",
     "RayCastSensor",
+    "SteppingGains",
     "TerrainHeightSensor",
     "UniformVelocityCommand",
     "UniformVelocityCommandCfg",
@@ -82,6 +81,7 @@ __all__ = [
     "root_height_l2",
     "root_near_feet",
     "self_collision_cost",
+    "stepping_action",
     "soft_landing",
     "terrain_edge_reached",
     "terrain_levels_vel",

@@ -137,6 +137,18 @@ class GaitClockCommand(CommandTerm):
             self._faded[index] = (self._faded[index] + change).clamp_(0.0, 1.0)
         super().compute(dt, env_ids)
 
+    def export_metadata(self, name: str) -> dict[str, list | str | float]:
+        """Return the clock, under the keys of `mjlab.rl.exporter_utils`."""
+        cfg = self.cfg
+        follows = cfg.velocity_command_name is not None
+        return {
+            "clock_command": name,
+            "clock_frequency": cfg.frequency,
+            "clock_fade_s": cfg.fade_s,
+            "clock_standing_threshold": cfg.standing_threshold if follows else 0.0,
+            "clock_starts": list(cfg.starts or ()),
+        }
+
     def _resample_command(self, env_ids: torch.Tensor) -> None:
         starts = self.cfg.starts
         if starts is None:

@@ -1,0 +1,194 @@
+"""Stepping controller: a biped that marches in place and catches itself, to teach policies to step.
+
+A policy that learns to stand by its ankles finds no way to a step, because lifting a foot a little
+costs balance. This controller steps from the beginning, and balances as one-legged hoppers (Raibert,
+Legged Robots That Balance, 1986) and simulated bipeds (SIMBICON; Yin, Loken and van de Panne,
+SIGGRAPH 2007) do: the swing foot goes to where the robot moves, and the hip of the stance leg keeps
+the trunk upright. It takes no commands and knows the true state, so it is no policy for a robot.
+`RslRlSacAlgorithmCfg.teacher` lets one imitate it at first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mujoco
+import torch
+
+from mjlab.envs.mdp.actions import JointPositionAction
+from mjlab.tasks.velocity.mdp.gait import require_gait_clock
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.managers import ObservationTermCfg
+
+_SIDES = ("left", "right")
+# Each turns about its axis when the leg hangs straight, as on Unitree's humanoids.
+_AXES = {
+    "hip_pitch": (0.0, 1.0, 0.0),
+    "hip_roll": (1.0, 0.0, 0.0),
+    "hip_yaw": (0.0, 0.0, 1.0),
+    "knee": (0.0, 1.0, 0.0),
+    "ankle_pitch": (0.0, 1.0, 0.0),
+    "ankle_roll": (1.0, 0.0, 0.0),
+}
+_MIN_ALIGNMENT = 0.9
+# Largest action: atanh(1) is infinite.
+_LARGEST = 0.97
+
+
+@dataclass(kw_only=True)
+class SteppingGains:
+    """Gains of the stepping controller: numbers, or tensors (N, 1). The defaults are the G1's."""
+
+    bend: float = 0.1
+    """Bend of a leg on the ground (rad): of the hip, and of the ankle; the knee bends twice as much."""
+    lift: float = 0.42
+    """Further bend in the middle of a swing (rad)."""
+    lead: float = 0.085
+    """Forward angle of the swing leg at rest (rad)."""
+    step_forward: float = 0.6
+    """Forward angle of the swing leg for a forward velocity (rad s/m)."""
+    step_sideways: float = 0.96
+    """Sideward angle of the swing leg for a sideward velocity (rad s/m)."""
+    trunk_pitch: float = 9.0
+    """Pitch target of the stance hip for the trunk's pitch (rad/rad)."""
+    trunk_roll: float = 5.9
+    """Roll target of the stance hip for the trunk's roll (rad/rad)."""
+    trunk_roll_rate: float = 0.26
+    """Roll target of the stance hip for the trunk's roll rate (s)."""
+    ankle_forward: float = 3.8
+    """Pitch target of the stance ankle for a forward velocity (rad s/m)."""
+    ankle_sideways: float = 1.3
+    """Roll target of the stance ankle for a sideward velocity (rad s/m)."""
+
+
+class stepping_action:
+    """Action (N, A) of the stepping controller, for a joint position action; -1 to 1.
+
+    With the gait clock's phase c of a leg (strides), the leg swings for c < 1/2 and stands else. Its
+    angles against the trunk are the measured alpha = -q_hip_pitch - q_knee / 2, forward, and
+    beta = q_hip_roll, to the left. Targets, with v the velocity of the root and w its angular velocity
+    in the root's frame, and x = 3 s^2 - 2 s^3 with s = min(1, 4 c):
+
+        swing    alpha* = alpha + x (lead + step_forward v_x - alpha)
+                 beta*  = beta + x (step_sideways v_y - beta)
+        stance   alpha* = alpha - trunk_pitch pitch
+                 beta*  = beta + trunk_roll roll + trunk_roll_rate w_x
+        bend     b = bend + A lift max(0, sin 2 pi c), with A the clock's amplitude
+        joints   hip_pitch = -alpha* - b, knee = 2 b, hip_roll = beta*
+
+    Ankles make the sole of an upright robot level, at the angles before the trunk's feedback. Those of a swing
+    leg subtract the trunk's pitch and roll, those of a stance leg add `ankle_forward v_x` and
+    `-ankle_sideways v_y`. Other joints have their default positions. Hip yaw is 2, outside the range of
+    actions, and so not imitated.
+
+    Params:
+        gains: `SteppingGains`.
+        command_name: Gait clock.
+        action_name: Joint position action of the biped, with a scale.
+        joint: Name of a joint, with `{side}` (left, right) and `{joint}` (hip_pitch, hip_roll, hip_yaw,
+            knee, ankle_pitch, ankle_roll), which turn about y, x, z, y, y, x of the robot.
+
+    Raises, when built: `ValueError` for an action of another kind, one without one of the joints, joints
+    about other axes, or a command that is no gait clock.
+    """
+
+    # Follows from config and model, so it is no run-time state.
+    _transient = {"_clock", "_term", "_columns", "_joints"}
+
+    def __init__(self, cfg: ObservationTermCfg, env: ManagerBasedRlEnv) -> None:
+        params = cfg.params
+        self._clock = require_gait_clock(env, params.get("command_name", "gait"))
+        name = params.get("action_name", "joint_pos")
+        term = env.action_manager.get_term(name)
+        if not isinstance(term, JointPositionAction):
+            raise ValueError(
+                f"action_name: expected a JointPositionAction, got {name!r}, a {type(term).__name__}."
+            )
+        self._term = term
+        asset: Entity = env.scene[term.cfg.entity_name]
+        pattern = params.get("joint", "{side}_{joint}_joint")
+        self._joints: dict[str, torch.Tensor] = {}
+        self._columns: dict[str, torch.Tensor] = {}
+
+        def ids(values: list[int]) -> torch.Tensor:
+            return torch.tensor(values, device=env.device)
+
+        for joint, axis in _AXES.items():
+            names = [pattern.format(side=side, joint=joint) for side in _SIDES]
+            missing = [one for one in names if one not in term.target_names]
+            if missing:
+                raise ValueError(
+                    f"joint: expected joints of the action {name!r}, got {missing}; it has "
+                    f"{list(term.target_names)}."
+                )
+            self._joints[joint] = ids([asset.joint_names.index(one) for one in names])
+            self._columns[joint] = ids([term.target_names.index(one) for one in names])
+            _check_axes(env, asset, names, axis)
+
+    def __call__(
+        self,
+        env: ManagerBasedRlEnv,
+        gains: SteppingGains | None = None,
+        command_name: str = "gait",
+        action_name: str = "joint_pos",
+        joint: str = "{side}_{joint}_joint",
+    ) -> torch.Tensor:
+        """Return the action, (N, A)."""
+        g = SteppingGains() if gains is None else gains
+        data = env.scene[self._term.cfg.entity_name].data
+        velocity = data.root_link_lin_vel_b
+        gravity = data.projected_gravity_b
+        pitch, roll = gravity[:, :1], -gravity[:, 1:2]
+        roll_rate = data.root_link_ang_vel_b[:, :1]
+
+        phase = self._clock.phase.unsqueeze(1)
+        height = torch.cat((torch.sin(phase), -torch.sin(phase)), dim=1)
+        swings = height > 0.0
+        s = (torch.remainder(phase, torch.pi) * (2.0 / torch.pi)).clamp(max=1.0)
+        x = s * s * (3.0 - 2.0 * s)
+
+        q = data.joint_pos
+        alpha = -q[:, self._joints["hip_pitch"]] - 0.5 * q[:, self._joints["knee"]]
+        beta = q[:, self._joints["hip_roll"]]
+        forward = g.lead + g.step_forward * velocity[:, :1]
+        sideways = g.step_sideways * velocity[:, 1:2]
+        alpha = torch.where(swings, torch.lerp(alpha, forward.expand_as(alpha), x), alpha)
+        beta = torch.where(swings, torch.lerp(beta, sideways.expand_as(beta), x), beta)
+        bend = g.bend + g.lift * height.clamp(min=0.0) * self._clock.amplitude.unsqueeze(1)
+        stands = ~swings
+
+        upright = stands * g.trunk_pitch * pitch
+        leveled = stands * (g.trunk_roll * roll + g.trunk_roll_rate * roll_rate)
+        targets = data.default_joint_pos[:, self._term.target_ids].clone()
+        targets[:, self._columns["hip_pitch"]] = upright - alpha - bend
+        targets[:, self._columns["knee"]] = 2.0 * bend
+        targets[:, self._columns["hip_roll"]] = beta + leveled
+        targets[:, self._columns["ankle_pitch"]] = (
+            alpha - bend + torch.where(swings, -pitch, g.ankle_forward * velocity[:, :1])
+        )
+        targets[:, self._columns["ankle_roll"]] = (
+            torch.where(swings, -roll, -g.ankle_sideways * velocity[:, 1:2]) - beta
+        )
+        actions = ((targets - self._term.offset) / self._term.scale).clamp_(-_LARGEST, _LARGEST)
+        actions[:, self._columns["hip_yaw"]] = 2.0
+        return actions
+
+
+def _check_axes(
+    env: ManagerBasedRlEnv, asset: Entity, names: list[str], axis: tuple[float, float, float]
+) -> None:
+    model = env.sim.mj_model
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    for name in names:
+        joint = asset.indexing.joint_ids[asset.joint_names.index(name)].item()
+        along = float(data.xaxis[joint] @ axis)
+        if along < _MIN_ALIGNMENT:
+            raise ValueError(
+                f"joint: expected {name!r} to turn about {axis} in the model's reference pose, got "
+                f"{data.xaxis[joint].round(2).tolist()}; the stepping controller knows no other legs."
+            )

@@ -1,0 +1,125 @@
+"""The stepping controller: it steps, it does not fall, and it is built for legs that it knows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.envs import mdp as envs_mdp
+from mjlab.managers import ObservationGroupCfg, ObservationTermCfg
+from mjlab.tasks.registry import load_env_cfg
+from mjlab.tasks.velocity import mdp
+from mjlab.tasks.velocity.mirror import mirror_of_joints
+from mjlab.tasks.velocity.symmetry import mirror_left_right
+
+G1, GO1 = "Mjlab-Velocity-Flat-Unitree-G1", "Mjlab-Velocity-Flat-Unitree-Go1"
+
+
+def make_env(task: str = G1, profile: str | None = "cpu", num_envs: int = 4, **params: Any):
+    cfg = load_env_cfg(task, profile=profile)
+    cfg.scene.num_envs, cfg.seed = num_envs, 0
+    cfg.events.pop("push_robot")
+    if profile is None:
+        cfg.commands["gait"] = mdp.GaitClockCommandCfg()
+    teacher = ObservationTermCfg(func=mdp.stepping_action, params=params)
+    cfg.observations["teacher"] = ObservationGroupCfg(terms={"step": teacher})
+    return ManagerBasedRlEnv(cfg, device="cpu")
+
+
+@pytest.fixture
+def env():
+    env = make_env(num_envs=32)
+    yield env
+    env.close()
+
+
+def lives(env: ManagerBasedRlEnv, steps: int, follow: bool) -> torch.Tensor:
+    """Return for how many of `steps` each environment stands, (N,), and lift feet meanwhile."""
+    obs, _ = env.reset()
+    alive = torch.ones(env.num_envs, dtype=torch.bool)
+    life = torch.zeros(env.num_envs)
+    for _ in range(steps):
+        shown = obs["teacher"]
+        actions = torch.where(shown.abs() < 1.0, shown, 0.0) if follow else torch.zeros_like(shown)
+        obs, *_ = env.step(actions)
+        alive &= ~env.reset_buf.bool()
+        life += alive
+    return life
+
+
+def test_a_robot_that_it_drives_steps_and_stands_where_one_in_its_default_pose_falls(env):
+    assert (lives(env, 150, follow=False) < 150).all()
+    assert (lives(env, 150, follow=True) == 150).float().mean() > 0.8
+    highest = torch.zeros(2)
+    obs = env.observation_manager.compute()
+    for _ in range(40):
+        shown = obs["teacher"]
+        obs, *_ = env.step(torch.where(shown.abs() < 1.0, shown, 0.0))
+        heights = env.scene["foot_height_scan"].data.heights
+        highest = torch.maximum(highest, heights.median(dim=0).values)
+    assert (highest > 0.02).all()
+
+
+def test_the_image_of_what_it_does_is_what_it_does_in_the_mirror(env):
+    """Half a stride later, and with the state turned to the other side, the other leg does the same."""
+    obs, _ = env.reset()
+    for _ in range(20):
+        obs, *_ = env.step(0.3 * torch.randn(32, 29))
+    act = mdp.stepping_action(ObservationTermCfg(func=mdp.stepping_action, params={}), env)
+    shown = act(env)
+    robot, clock = env.scene["robot"], env.command_manager.get_term("gait")
+    joints, velocities = robot.data.joint_pos.clone(), robot.data.root_link_vel_w.clone()
+    pose = robot.data.root_link_pose_w.clone()
+    _, mirrored = mirror_left_right(env, actions=shown)
+    wanted = mirrored[32:]
+    mirror = mirror_of_joints(env.sim.mj_model, robot)
+    flipped = pose.clone()
+    flipped[:, 1] *= -1.0
+    flipped[:, 4] *= -1.0
+    flipped[:, 6] *= -1.0
+    velocities = velocities * torch.tensor([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+    robot.write_root_link_pose_to_sim(flipped)
+    robot.write_root_link_velocity_to_sim(velocities)
+    robot.write_joint_position_to_sim(mirror(joints))
+    env.sim.forward()
+    clock.cycles.add_(0.5).remainder_(1.0)
+    found = act(env)
+    has_opinion = wanted.abs() < 1.0
+    assert torch.equal(found.abs() < 1.0, has_opinion)
+    assert (has_opinion.sum(dim=1) == 27).all()
+    torch.testing.assert_close(found[has_opinion], wanted[has_opinion], atol=1e-4, rtol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("task", "profile", "params", "facts"),
+    [
+        (GO1, None, {}, ("left_hip_pitch_joint", "FR_hip_joint")),
+        (G1, "cpu", {"joint": "{side}_wrist_{joint}"}, ("left_wrist_hip_pitch",)),
+        (G1, "cpu", {"command_name": "twist"}, ("'twist'", "GaitClockCommand")),
+        (G1, "cpu", {"action_name": "none-such"}, ("none-such",)),
+    ],
+)
+def test_robots_that_it_does_not_know_are_refused(task, profile, params, facts):
+    with pytest.raises((ValueError, KeyError)) as caught:
+        make_env(task, profile, **params).close()
+    for fact in facts:
+        assert fact in str(caught.value)
+
+
+def test_joints_about_other_axes_are_refused(monkeypatch):
+    monkeypatch.setitem(mdp.stepping_action.__init__.__globals__["_AXES"], "knee", (1.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="left_knee_joint.*turn about"):
+        make_env().close()
+
+
+def test_it_needs_an_action_of_joint_positions():
+    cfg = load_env_cfg(G1, profile="cpu")
+    cfg.scene.num_envs = 2
+    cfg.actions["joint_pos"] = envs_mdp.JointEffortActionCfg(
+        entity_name="robot", actuator_names=(".*",)
+    )
+    with pytest.raises(ValueError, match="JointPositionAction.*'joint_pos'.*JointEffortAction"):
+        ManagerBasedRlEnv(cfg, device="cpu").close()
