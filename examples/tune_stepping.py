@@ -35,9 +35,9 @@ def make_env(task: str, num_envs: int, frequency: float, pushes: float) -> Manag
     cfg = load_env_cfg(task, profile="cpu")
     cfg.scene.num_envs, cfg.seed = num_envs, 0
     cfg.curriculum, cfg.rewards = {}, {}
-    cfg.commands["gait"] = mdp.GaitClockCommandCfg(
-        frequency=frequency, starts=(0.0, 0.5), fade_s=0.3, velocity_command_name=None
-    )
+    clock = cfg.commands["gait"]
+    assert isinstance(clock, mdp.GaitClockCommandCfg)
+    clock.frequency = frequency
     push = cfg.events["push_robot"]
     assert push is not None
     ranges = push.params["velocity_range"]

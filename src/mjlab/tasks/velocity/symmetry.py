@@ -271,7 +271,8 @@ def _lever_arms(env: ManagerBasedRlEnv, group: str, starts: dict[str, int]) -> l
                 f"The observation {group}/{name} is the velocity of a point {sensor.y:.3g} m to the "
                 "left of the middle. Its mirror image depends on the angular velocity of "
                 f"{env.sim.mj_model.body(sensor.body).name!r}; observe that in group {group!r} too, "
-                f"with the same history_length, and without delay or with the same fixed one, or use base_lin_vel. {WITHOUT}"
+                "with the same history_length, and without delay or with the same fixed one, or use "
+                f"base_lin_vel. {WITHOUT}"
             )
     return couplings
 

@@ -117,6 +117,8 @@ class stepping_action:
         def ids(values: list[int]) -> torch.Tensor:
             return torch.tensor(values, device=env.device)
 
+        reference = mujoco.MjData(env.sim.mj_model)
+        mujoco.mj_kinematics(env.sim.mj_model, reference)
         for joint, axis in _AXES.items():
             names = [pattern.format(side=side, joint=joint) for side in _SIDES]
             missing = [one for one in names if one not in term.target_names]
@@ -127,7 +129,7 @@ class stepping_action:
                 )
             self._joints[joint] = ids([asset.joint_names.index(one) for one in names])
             self._columns[joint] = ids([term.target_names.index(one) for one in names])
-            _check_axes(env, asset, names, axis)
+            _check_axes(reference, asset, names, axis)
 
     def __call__(
         self,
@@ -179,11 +181,8 @@ class stepping_action:
 
 
 def _check_axes(
-    env: ManagerBasedRlEnv, asset: Entity, names: list[str], axis: tuple[float, float, float]
+    data: mujoco.MjData, asset: Entity, names: list[str], axis: tuple[float, float, float]
 ) -> None:
-    model = env.sim.mj_model
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
     for name in names:
         joint = asset.indexing.joint_ids[asset.joint_names.index(name)].item()
         along = float(data.xaxis[joint] @ axis)
