@@ -74,6 +74,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "all": {
         "symmetry_cfg": MIRROR,
         "noise_hold": 4,
+        "policy_average": 0.1,
         "num_steps_return": 3,
         "use_mixed_precision": True,
         "pessimistic": True,

@@ -138,6 +138,9 @@ class RslRlSacAlgorithmCfg:
     imitation: tuple[tuple[int, float], ...] = ((0, 0.0),)
     """Weight of the squared distance from the teacher's action in the loss of the policy: points
     (environment step, weight), with lines between them."""
+    policy_average: float = 1.0
+    """Share by which the weights of the policy that acts follow those that are learned, at every
+    environment step; 1 takes them over. An average falls less often than the newest weights do."""
     noise_hold: int = 1
     """Most steps for which an environment keeps its exploration noise; 1 draws it at every step."""
     symmetry_cfg: dict[str, Any] | None = None

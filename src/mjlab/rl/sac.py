@@ -72,6 +72,7 @@ class SAC:
         target_std: float,
         pessimistic: bool,
         mean_penalty: float,
+        policy_average: float,
         noise_hold: int,
         scales_rewards: bool,
         teacher: str | None = None,
@@ -101,6 +102,7 @@ class SAC:
         self._batch_size, self._num_updates = batch_size, num_updates
         self._policy_delay, self._learning_starts = policy_delay, learning_starts
         self._pessimistic, self._mean_penalty = pessimistic, mean_penalty
+        self._policy_average = policy_average
         self._log_alpha = nn.Parameter(torch.tensor(math.log(init_alpha), device=device))
         self._log_alpha_range = (math.log(alpha_range[0]), math.log(alpha_range[1]))
         num_actions = _of(actor).output_dim
@@ -187,7 +189,7 @@ class SAC:
                 model.update_normalization(obs)
             if self._reward_scale is not None:
                 self._reward_scale.update(rewards, dones, together=self._multi_gpu is not None)
-            self._policy.load_state_dict(self.actor.state_dict())
+            self._follow_actor()
         self._num_steps += 1
         if self._num_steps < self._learning_starts:
             return
@@ -198,6 +200,13 @@ class SAC:
             return
         with torch.inference_mode(False), torch.enable_grad():
             self._learn()
+
+    def _follow_actor(self) -> None:
+        """Let the policy take over what was learned: parameters in part, observation statistics at once."""
+        for own, learned in zip(self._policy.parameters(), self.actor.parameters(), strict=True):
+            own.lerp_(learned, self._policy_average)
+        for own, learned in zip(self._policy.buffers(), self.actor.buffers(), strict=True):
+            own.copy_(learned)
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Do nothing: there are no returns of whole episodes."""
