@@ -14,6 +14,7 @@ from onnx import TensorProto, helper
 
 from mjlab.rl.onnx_export import export_to_onnx
 from mjlab.rl.onnx_policy import OnnxPolicy, OnnxPolicyError, _alike, load_onnx_policy
+from mjlab.rl.rsl import RNNModel, TensorDict
 
 ACTIVATIONS = {
     "elu": torch.nn.ELU(),
@@ -73,6 +74,43 @@ def test_it_computes_what_onnxruntime_does(tmp_path: Path, activation: str) -> N
     assert (policy.num_observations, policy.num_actions) == (5, 3)
 
 
+@pytest.mark.parametrize("layers", [1, 2])
+@pytest.mark.parametrize("kind", ["lstm", "gru"])
+def test_memory_is_kept_for_each_environment_and_forgotten_at_the_end_of_its_episode(
+    tmp_path: Path, kind: str, layers: int
+) -> None:
+    torch.manual_seed(1)
+    observations = TensorDict({"actor": torch.zeros(3, 5)}, batch_size=[3])
+    model = RNNModel(
+        observations, {"actor": ["actor"]}, "actor", 2, (8,), rnn_type=kind, rnn_hidden_dim=6,
+        rnn_num_layers=layers,
+    )  # fmt: skip
+    export_to_onnx(model.as_onnx(), tmp_path / "p.onnx")
+    policy = OnnxPolicy(tmp_path / "p.onnx")
+    session = onnxruntime.InferenceSession(str(tmp_path / "p.onnx"))
+    memories = [item.name for item in session.get_inputs()][1:]
+    zeros = {name: np.zeros((layers, 1, 6), np.float32) for name in memories}
+    remembered = [dict(zeros) for _ in range(3)]
+    for step in range(6):
+        seen = torch.randn(3, 5)
+        actions, own = policy(seen), model(TensorDict({"actor": seen}, batch_size=[3]))
+        torch.testing.assert_close(actions, own, rtol=1e-4, atol=1e-5)
+        for env in range(3):
+            inputs = {"obs": seen[env : env + 1].numpy(), **remembered[env]}
+            action, *after = session.run(None, inputs)
+            np.testing.assert_allclose(actions[env : env + 1], action, rtol=1e-4, atol=1e-5)
+            remembered[env] = dict(zip(memories, after, strict=True))
+        dones = torch.tensor([step == 1, False, step == 3]).long()
+        for forgets in (policy, model):
+            forgets.reset(dones)
+        for env in dones.nonzero().flatten().tolist():
+            remembered[env] = dict(zeros)
+    # Everything is forgotten, and then all are the same.
+    assert len(policy(torch.ones(3, 5)).unique(dim=0)) == 3
+    policy.reset()
+    assert len(policy(torch.ones(3, 5)).unique(dim=0)) == 1
+
+
 def test_it_takes_the_group_of_observations_that_it_was_trained_with(tmp_path: Path) -> None:
     policy = OnnxPolicy(export(tmp_path / "p.onnx", observation_group="walker"))
     rows = torch.randn(2, 5)
@@ -102,9 +140,9 @@ def graph(path: Path, nodes: list, inputs: list[str], outputs: list[str]) -> Pat
 
 
 def test_operators_and_inputs_that_are_not_known_are_named(tmp_path: Path) -> None:
-    lstm = graph(tmp_path / "l.onnx", [helper.make_node("LSTM", ["x"], ["y"])], ["x"], ["y"])
-    with pytest.raises(OnnxPolicyError, match=r"operator LSTM.*Gemm.*Play the checkpoint"):
-        OnnxPolicy(lstm)
+    rnn = graph(tmp_path / "r.onnx", [helper.make_node("RNN", ["x"], ["y"])], ["x"], ["y"])
+    with pytest.raises(OnnxPolicyError, match=r"operator RNN.*Gemm.*Play the checkpoint"):
+        OnnxPolicy(rnn)
     two = graph(
         tmp_path / "2.onnx", [helper.make_node("Add", ["x", "h"], ["y"])], ["x", "h"], ["y"]
     )

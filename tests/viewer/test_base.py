@@ -135,6 +135,23 @@ def test_reset_also_resets_a_policy_with_memory(viewer) -> None:
     assert viewer.get_status().step_count == 0
 
 
+def test_a_policy_with_memory_forgets_what_ended(viewer) -> None:
+    seen = []
+
+    class Recurrent:
+        def __call__(self, obs):
+            return torch.zeros(len(obs), 1)
+
+        def reset(self, dones=None):
+            seen.append(dones)
+
+    viewer.policy = Recurrent()
+    dones = torch.tensor([1])
+    viewer.env.step = lambda actions: (None, None, dones, {})
+    viewer.step_simulation()
+    assert seen == [dones]
+
+
 def test_a_reset_that_fails_is_shown_and_ends_nothing(viewer) -> None:
     viewer.env.reset = lambda: 1 / 0
     viewer.request_reset()

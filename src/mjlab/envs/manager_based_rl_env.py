@@ -54,6 +54,8 @@ class ManagerBasedRlEnv:
     Attributes:
         observes_ends: Have `step` return the observations in which episodes run out of time. False
             at first; learners that bootstrap from them switch it on.
+        observes_failures: With `observes_ends`, return also those in which episodes terminate. False
+            at first; adapters to interfaces that have them switch it on.
     """
 
     is_vector_env = True
@@ -92,7 +94,7 @@ class ManagerBasedRlEnv:
         if self.scene.sensor_context is not None:
             self.sim.set_sensor_context(self.scene.sensor_context)
 
-        self.observes_ends = False
+        self.observes_ends = self.observes_failures = False
         self.common_step_counter = 0
         self._holds_common_steps = False
         self._sim_step_counter = 0
@@ -102,7 +104,7 @@ class ManagerBasedRlEnv:
         # What `_command_dt` returns in a step with resets. Kept, because torch counts no writes to a
         # tensor made under `inference_mode`, and by these a `Lookup` knows that it is valid.
         self._command_dts = torch.zeros(self.num_envs, dtype=torch.float32, device=device)
-        self._ended, self._timed_out = Lookup(), Lookup()
+        self._ended, self._observed = Lookup(), Lookup()
         self._looks_ahead = torch.device(device).type == "cuda"
         self._renderer: OffscreenRenderer | None = None
         self._renderer_is_open = False
@@ -298,7 +300,8 @@ class ManagerBasedRlEnv:
         `sim.forward(env_ids)`, on the environments concerned.
 
         With `observes_ends` and `auto_reset`, steps in which episodes run out of time (truncated and
-        not terminated) observe these k environments before they are reset.
+        not terminated) observe these k environments before they are reset; with `observes_failures`
+        too, all that end, but those whose state is not finite.
         `extras["final_observations"]` is what `step` would have returned for them had the episodes
         gone on, group to (k, ...), and `extras["final_ids"]` are their ids (k,), ascending. Only
         commands are those that acted in the step: they have neither advanced nor been redrawn.
@@ -396,7 +399,7 @@ class ManagerBasedRlEnv:
         """End the episode of environments whose state is not finite, and count them."""
         # A sum is finite only if every summand is. `isfinite` takes twice the operations.
         checksum = self.sim.data.qpos.sum(dim=1) + self.sim.data.qvel.sum(dim=1)
-        diverged = ~(checksum.abs() < math.inf)
+        self._diverged = diverged = ~(checksum.abs() < math.inf)
         self.reset_terminated |= diverged
         self.reset_buf |= diverged
         self._nan_resets += diverged
@@ -416,8 +419,7 @@ class ManagerBasedRlEnv:
         if self.cfg.auto_reset:
             lookups.append(self._ended.plan(self.reset_buf, self.reset_buf))
             if self.observes_ends:
-                flags = self.reset_time_outs, self.reset_terminated
-                lookups.append(self._timed_out.plan(flags[0] & ~flags[1], *flags))
+                lookups.append(self._observed.plan(*self._observed_ends()))
         look_up(lookups)
 
     def _clear_extras(self) -> None:
@@ -426,7 +428,7 @@ class ManagerBasedRlEnv:
             self.extras.pop(name, None)
 
     def _observe_ends(self, moved: torch.Tensor | None) -> None:
-        """Put the observations of episodes that run out of time into `extras`; see `step`.
+        """Put the observations of episodes that end into `extras`; see `step`.
 
         What resets and curricula read (derived quantities, rays, images, random numbers) is left as
         it would be without.
@@ -434,10 +436,10 @@ class ManagerBasedRlEnv:
         Args:
             moved: (N,) bool, environments in which an event placed something; None for nowhere.
         """
-        flags = self.reset_time_outs, self.reset_terminated
-        ids = self._timed_out.take(*flags)
+        ends, *flags = self._observed_ends()
+        ids = self._observed.take(*flags)
         if ids is None:
-            ids = (flags[0] & ~flags[1]).nonzero().flatten()
+            ids = ends.nonzero().flatten()
         if len(ids) == 0:
             return
         with self.sim.looking_ahead(ids):
@@ -452,6 +454,13 @@ class ManagerBasedRlEnv:
             for name, value in observations.items()
         }
         self.extras["final_ids"] = ids
+
+    def _observed_ends(self) -> tuple[torch.Tensor, ...]:
+        """Return which environments are observed as they end, (N,), and what this follows from."""
+        if self.observes_failures:
+            return self.reset_buf & ~self._diverged, self.reset_buf, self._diverged
+        flags = self.reset_time_outs, self.reset_terminated
+        return flags[0] & ~flags[1], *flags
 
     def _reset_done_envs(self) -> torch.Tensor:
         """Reset environments that are done, under `auto_reset`; return their ids."""

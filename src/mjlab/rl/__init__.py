@@ -16,8 +16,10 @@ if TYPE_CHECKING:
     from mjlab.rl.config import RslRlModelCfg as RslRlModelCfg
     from mjlab.rl.config import RslRlOnPolicyRunnerCfg as RslRlOnPolicyRunnerCfg
     from mjlab.rl.config import RslRlPpoAlgorithmCfg as RslRlPpoAlgorithmCfg
+    from mjlab.rl.gymnasium_vector import gymnasium_env as gymnasium_env
     from mjlab.rl.runner import MjlabOnPolicyRunner as MjlabOnPolicyRunner
     from mjlab.rl.vecenv_wrapper import RslRlVecEnvWrapper as RslRlVecEnvWrapper
+    from mjlab.rl.vector_checks import check_vector_env as check_vector_env
 
 _HOMES = {
     "EvaluationCfg": "mjlab.rl.config",
@@ -28,6 +30,11 @@ _HOMES = {
     "RslRlPpoAlgorithmCfg": "mjlab.rl.config",
     "RslRlVecEnvWrapper": "mjlab.rl.vecenv_wrapper",
 }
+# Not for `import *`, because Gymnasium need not be there.
+_WITH_GYMNASIUM = {
+    "check_vector_env": "mjlab.rl.vector_checks",
+    "gymnasium_env": "mjlab.rl.gymnasium_vector",
+}
 __all__ = sorted(_HOMES)
 
-__getattr__ = lazy_names(__name__, _HOMES)
+__getattr__ = lazy_names(__name__, {**_HOMES, **_WITH_GYMNASIUM})

@@ -181,7 +181,10 @@ def learner_of_checkpoint(path: str | os.PathLike[str]) -> Learner:
     Raises:
         CheckpointError: see `load_checkpoint`.
     """
-    return "sac" if _SAC_KEY in load_checkpoint(path) else "ppo"
+    checkpoint = load_checkpoint(path)
+    if "student_state_dict" in checkpoint:
+        return "distillation"
+    return "sac" if _SAC_KEY in checkpoint else "ppo"
 
 
 def _missing_message(path: Path) -> str:

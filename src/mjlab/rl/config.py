@@ -267,6 +267,53 @@ class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
     """The learning algorithm."""
 
 
+@dataclass
+class RslRlDistillationAlgorithmCfg:
+    """Imitation of a teacher on the states that the student leads to (DAgger; arXiv 1011.0686)."""
+
+    num_learning_epochs: int = 1
+    """Passes over the data of an iteration."""
+    gradient_length: int = 8
+    """Environment steps for one update; a recurrent student learns through as many. It should divide
+    epochs times steps of an iteration: what is left over teaches nothing."""
+    learning_rate: float = 1e-3
+    """Learning rate."""
+    max_grad_norm: float | None = 1.0
+    """Gradients are scaled down to this norm; None leaves them."""
+    loss_type: Literal["mse", "huber"] = "mse"
+    """Distance between the actions of student and teacher."""
+    optimizer: Literal["adam", "adamw", "sgd", "rmsprop"] = "adam"
+    """Optimizer."""
+    use_mixed_precision: bool = False
+    """Mixed precision: bfloat16 in the networks while learning."""
+    class_name: str = "Distillation"
+    """A class of rsl_rl, or `module:Class`."""
+
+
+@dataclass
+class RslRlDistillationRunnerCfg(RslRlBaseRunnerCfg):
+    """A training run in which a student learns to act as a trained teacher does."""
+
+    obs_groups: dict[str, tuple[str, ...]] = field(
+        default_factory=lambda: {"student": ("actor",), "teacher": ("actor",)}
+    )
+    """For each model, the observation groups that it gets, concatenated in this order."""
+    class_name: str = "DistillationRunner"
+    """The runner, by rsl_rl's name."""
+    student: RslRlModelCfg = field(
+        default_factory=lambda: RslRlModelCfg(distribution_cfg=gaussian_distribution(0.1))
+    )
+    """The policy network. Its deviation is that of the actions while learning, and does not change."""
+    teacher: RslRlModelCfg = field(
+        default_factory=lambda: RslRlModelCfg(distribution_cfg=gaussian_distribution())
+    )
+    """The teacher's network, as it was trained. `train` takes sizes and kind from the teacher's run."""
+    algorithm: RslRlDistillationAlgorithmCfg = field(default_factory=RslRlDistillationAlgorithmCfg)
+    """The learning algorithm."""
+    teacher_checkpoint: str | None = None
+    """Checkpoint of the teacher, trained with PPO. A resumed run has its teacher already."""
+
+
 def squashed_gaussian(init_std: float = 0.15, log_std_max: float = 0.0) -> dict[str, Any]:
     """Return a `distribution_cfg`: normal, through tanh, with deviations that the network gives."""
     return {

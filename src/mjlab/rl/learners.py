@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from typing import Any, Literal, get_args
 
 from mjlab.rl.config import (
     RslRlBaseRunnerCfg,
+    RslRlDistillationRunnerCfg,
+    RslRlModelCfg,
     RslRlOffPolicyRunnerCfg,
     RslRlOnPolicyRunnerCfg,
 )
 
-Learner = Literal["ppo", "sac"]
+Learner = Literal["ppo", "sac", "distillation"]
 LEARNERS: tuple[Learner, ...] = get_args(Learner)
 
 _MIRROR_FUNCTION = "data_augmentation_func"
@@ -27,7 +29,9 @@ def check_learner(name: str) -> None:
 
 
 def learner_of(cfg: RslRlBaseRunnerCfg) -> Learner:
-    """Return the learner of a config: `sac` if it is off-policy, else `ppo`."""
+    """Return the learner of a config: `ppo` unless it is one of another."""
+    if isinstance(cfg, RslRlDistillationRunnerCfg):
+        return "distillation"
     return "sac" if isinstance(cfg, RslRlOffPolicyRunnerCfg) else "ppo"
 
 
@@ -35,16 +39,22 @@ def with_learner(cfg: RslRlBaseRunnerCfg, learner: Learner) -> RslRlBaseRunnerCf
     """Return `cfg` if it is of `learner`, else a config of `learner` for the same run.
 
     The fields of `RslRlBaseRunnerCfg` are copied, and the function that makes mirror images.
-    Networks and algorithm have the defaults of the learner.
+    Networks and algorithm have the defaults of the learner, but for distillation: there the teacher is
+    the actor of `cfg`, and the student a network like it, with the same observations.
 
     Raises:
-        ValueError: the learner is unknown, or is SAC and a network of `cfg` is recurrent or has an
-            image encoder.
+        ValueError: the learner is unknown; or is SAC, and a network of `cfg` is recurrent or has an
+            image encoder; or is distillation, and `cfg` is not one of PPO.
     """
     check_learner(learner)
     if learner_of(cfg) == learner:
         return cfg
     base = {field.name: getattr(cfg, field.name) for field in fields(RslRlBaseRunnerCfg)}
+    if learner == "distillation":
+        return _distillation(cfg, base)
+    if learner_of(cfg) == "distillation":
+        # Groups of other networks.
+        del base["obs_groups"]
     symmetry = getattr(getattr(cfg, "algorithm", None), "symmetry_cfg", None)
     if learner == "sac":
         _check_networks_are_plain(cfg)
@@ -56,6 +66,22 @@ def with_learner(cfg: RslRlBaseRunnerCfg, learner: Learner) -> RslRlBaseRunnerCf
     if symmetry:
         on_policy.algorithm.symmetry_cfg = {**symmetry, "use_data_augmentation": True}
     return on_policy
+
+
+def _distillation(cfg: RslRlBaseRunnerCfg, base: dict[str, Any]) -> RslRlDistillationRunnerCfg:
+    if learner_of(cfg) != "ppo":
+        raise ValueError(
+            f"distillation: expected a teacher of the learner 'ppo', got one of {learner_of(cfg)!r}."
+        )
+    teacher: RslRlModelCfg = copy.deepcopy(getattr(cfg, "actor", RslRlModelCfg()))
+    groups = cfg.obs_groups.get("actor", ("actor",))
+    made = RslRlDistillationRunnerCfg(**copy.deepcopy(base))
+    made.obs_groups = {"student": groups, "teacher": groups}
+    steps = made.num_steps_per_env
+    made.algorithm.gradient_length = max(k for k in range(1, 9) if steps % k == 0)
+    made.teacher = teacher
+    made.student = replace(copy.deepcopy(teacher), distribution_cfg=made.student.distribution_cfg)
+    return made
 
 
 def for_task_of(cfg: RslRlBaseRunnerCfg, other: RslRlBaseRunnerCfg) -> RslRlBaseRunnerCfg:

@@ -109,8 +109,7 @@ def check_fits(
     """
     if saved is None:
         raise CheckpointError(
-            f"The checkpoint {path!r} holds no {name} weights; it is not one of an actor-critic "
-            "run."
+            f"The checkpoint {path!r} holds no {name} weights; use one that the same learner wrote."
         )
     expected = {key: tuple(value.shape) for key, value in model.state_dict().items()}
     found = {key: tuple(value.shape) for key, value in saved.items() if hasattr(value, "shape")}

@@ -33,6 +33,12 @@ def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
     """
     if "replay_steps" in cfg["algorithm"]:
         _check_sac_models(observations, cfg)
+    student = cfg.get("student")
+    if isinstance(student, dict) and student.get("distribution_cfg") is None:
+        raise ValueError(
+            "agent.student distribution_cfg: expected a distribution, got None; use "
+            "gaussian_distribution(0.1), whose deviation is that of the actions while learning."
+        )
     shared = bool(cfg["algorithm"].get("share_cnn_encoders"))
     images = {}
     for model in _MODELS:

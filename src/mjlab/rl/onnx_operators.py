@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch.nn import functional
 
-Operator = Callable[..., torch.Tensor]
+Operator = Callable[..., torch.Tensor | tuple[torch.Tensor, ...]]
 
 # ONNX's numbers of types that a graph may cast to.
 _TYPES = {1: torch.float32, 6: torch.int32, 7: torch.int64, 9: torch.bool, 11: torch.float64}
@@ -127,6 +127,60 @@ def _pad(
     return functional.pad(x, sides, _PAD_MODES[mode], 0.0 if value is None else value.item())
 
 
+# Memory: sequences of (steps, batch, inputs), in one direction.
+
+
+def _lstm(
+    x: torch.Tensor,
+    weight: torch.Tensor,
+    recurrence: torch.Tensor,
+    bias: torch.Tensor | None = None,
+    lengths: None = None,
+    hidden: torch.Tensor | None = None,
+    cell: torch.Tensor | None = None,
+    *,
+    hidden_size: int,
+) -> tuple[torch.Tensor, ...]:
+    zeros = x.new_zeros(1, x.shape[1], hidden_size)
+    h, c = ((zeros if state is None else state).squeeze(0) for state in (hidden, cell))
+    outputs = []
+    for now in x.unbind(0):
+        gates = now @ weight[0].mT + h @ recurrence[0].mT
+        if bias is not None:
+            of_input, of_memory = bias[0].chunk(2)
+            gates = gates + of_input + of_memory
+        i, o, f, g = gates.chunk(4, dim=-1)
+        c = torch.sigmoid(f) * c + torch.sigmoid(i) * torch.tanh(g)
+        h = torch.sigmoid(o) * torch.tanh(c)
+        outputs.append(h)
+    return torch.stack(outputs).unsqueeze(1), h.unsqueeze(0), c.unsqueeze(0)
+
+
+def _gru(
+    x: torch.Tensor,
+    weight: torch.Tensor,
+    recurrence: torch.Tensor,
+    bias: torch.Tensor | None = None,
+    lengths: None = None,
+    hidden: torch.Tensor | None = None,
+    *,
+    hidden_size: int,
+    linear_before_reset: int = 0,
+) -> tuple[torch.Tensor, ...]:
+    if not linear_before_reset:
+        raise ValueError("GRU: expected linear_before_reset=1, as torch exports it, got 0.")
+    h = (x.new_zeros(1, x.shape[1], hidden_size) if hidden is None else hidden).squeeze(0)
+    of_input, of_memory = (0.0, 0.0) if bias is None else bias[0].chunk(2)
+    outputs = []
+    for now in x.unbind(0):
+        z, r, n = (now @ weight[0].mT + of_input).chunk(3, dim=-1)
+        z_h, r_h, n_h = (h @ recurrence[0].mT + of_memory).chunk(3, dim=-1)
+        z = torch.sigmoid(z + z_h)
+        h = (1.0 - z) * torch.tanh(n + torch.sigmoid(r + r_h) * n_h) + z * h
+        outputs.append(h)
+    return torch.stack(outputs).unsqueeze(1), h.unsqueeze(0)
+
+
 # Shapes.
 
 
@@ -172,6 +226,10 @@ def _unsqueeze(x: torch.Tensor, axes: torch.Tensor) -> torch.Tensor:
     for axis in sorted(axis % rank for axis in wanted):
         x = x.unsqueeze(axis)
     return x
+
+
+def _squeeze(x: torch.Tensor, axes: torch.Tensor | None = None) -> torch.Tensor:
+    return x.squeeze() if axes is None else x.squeeze(tuple(axes.tolist()))
 
 
 def _transpose(x: torch.Tensor, perm: list[int] | None = None) -> torch.Tensor:
@@ -231,7 +289,9 @@ OPERATORS: Mapping[str, Operator] = {
     "ConstantOfShape": _constant_of_shape,
     "Conv": _conv,
     "Flatten": _flatten,
+    "GRU": _gru,
     "GlobalAveragePool": _global_average_pool,
+    "LSTM": _lstm,
     "LayerNormalization": _layer_norm,
     "MaxPool": _max_pool,
     "Pad": _pad,
@@ -240,6 +300,7 @@ OPERATORS: Mapping[str, Operator] = {
     "Shape": _shape,
     "Slice": _slice,
     "Softmax": _softmax,
+    "Squeeze": _squeeze,
     "Transpose": _transpose,
     "Unsqueeze": _unsqueeze,
 }

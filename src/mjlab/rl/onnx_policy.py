@@ -1,8 +1,7 @@
 """Playing an exported policy: the graph of the ONNX file, computed by torch.
 
 So no ONNX runtime has to be installed, and one file plays in any number of environments, although
-it is exported for one. It covers networks of fully connected layers and of image encoders.
-Recurrent ones are refused; their checkpoints can be played.
+it is exported for one. It covers networks of fully connected layers, image encoders, LSTMs and GRUs.
 
 Only what the actions follow from is computed. A file may have further outputs, and inputs that these
 depend on: exported policies of motion tracking return the reference at an input `time_step`, which is
@@ -63,19 +62,22 @@ class _Step:
 
     operator: Operator
     inputs: tuple[str, ...]
-    output: str
+    outputs: tuple[str, ...]
     attributes: dict[str, Any]
 
-    def compute(self, values: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Return the output, from the values of the graph by name."""
+    def compute(self, values: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Return the outputs by name, from the values of the graph."""
         inputs = [values[name] if name else None for name in self.inputs]
-        return self.operator(*inputs, **self.attributes)
+        results = self.operator(*inputs, **self.attributes)
+        # An operator may have more results than the graph reads.
+        return dict(zip(self.outputs, results if isinstance(results, tuple) else (results,)))  # noqa: B905
 
 
 class OnnxPolicy(torch.nn.Module):
     """A policy that was exported to ONNX, for any number of environments.
 
-    Called with observations, it returns actions (N, num_actions).
+    Called with observations, it returns actions (N, num_actions). One with a memory remembers what it
+    was called with before, until `reset`.
 
     Attributes:
         metadata: What the file says about itself; see `mjlab.rl.exporter_utils`.
@@ -94,7 +96,7 @@ class OnnxPolicy(torch.nn.Module):
         Raises:
             OnnxPolicyError: the file is missing, no ONNX file, has no output that is called
                 `actions` nor only one; or the actions depend on other inputs than a flat
-                observation and images, or on an operator that is not known here.
+                observation, images and a memory, or on an operator that is not known here.
         """
         super().__init__()
         self.path = Path(path)
@@ -105,7 +107,16 @@ class OnnxPolicy(torch.nn.Module):
         # Sizes and axes, which stay on the CPU, where they are looked at.
         self._integers: dict[str, torch.Tensor] = {}
         output = self._find_output(model.graph)
-        nodes, needed = _leading_to(output.name, model.graph.node)
+        # Inputs of what is remembered, with the outputs that they are next. Named as rsl_rl does.
+        outputs = {item.name for item in model.graph.output}
+        inputs = {item.name: _dims(item) for item in model.graph.input}
+        pairs = (
+            (name, f"{name.removesuffix('_in')}_out") for name in inputs if name.endswith("_in")
+        )
+        self._memories = {before: after for before, after in pairs if after in outputs}
+        self._memory_shapes = {name: tuple(inputs[name]) for name in self._memories}
+        self._remembered: dict[str, torch.Tensor] = {}
+        nodes, needed = _leading_to({output.name, *self._memories.values()}, model.graph.node)
         for initializer in model.graph.initializer:
             if initializer.name in needed:
                 self._add_constant(initializer.name, tensor_value(initializer))
@@ -116,7 +127,7 @@ class OnnxPolicy(torch.nn.Module):
         self.num_actions = _dims(output)[-1]
         self._steps = [self._read(node) for node in nodes]
         kinds = {node.op_type for node in nodes}
-        self._is_row_wise = not self.image_shapes and kinds <= set(ROW_WISE)
+        self._is_row_wise = not self.image_shapes and not self._memories and kinds <= set(ROW_WISE)
         if not self._is_row_wise:
             self._compute_sizes()
         self.requires_grad_(False)
@@ -134,10 +145,31 @@ class OnnxPolicy(torch.nn.Module):
         if self._state is not None:
             inputs[self._state] = self._flat(observations)
         if self._is_row_wise:
-            return self._run(inputs)
+            return self._run(inputs)[self._output]
         # The graph is that of one environment, and so it stays: torch adds the batch around it.
         alone = {name: value.unsqueeze(1) for name, value in inputs.items()}
-        return torch.vmap(self._run)(alone).squeeze(1)
+        results = torch.vmap(self._run)(alone | self._memory(alone))
+        for before, after in self._memories.items():
+            self._remembered[before] = results[after]
+        return results[self._output].squeeze(1)
+
+    def reset(self, dones: torch.Tensor | None = None) -> None:
+        """Forget what was seen in environments where `dones` (N,) is not 0; None: in all."""
+        if dones is None:
+            self._remembered.clear()
+            return
+        for name, value in self._remembered.items():
+            ended = (dones != 0).view(-1, *(1 for _ in value.shape[1:]))
+            self._remembered[name] = torch.where(ended, 0.0, value)
+
+    def _memory(self, inputs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Return what is remembered in each environment, (N, *shape) by name; zeros at first."""
+        if not self._memories or self._remembered:
+            return self._remembered
+        like = next(iter(inputs.values()))
+        return {
+            name: like.new_zeros(len(like), *shape) for name, shape in self._memory_shapes.items()
+        }
 
     def check_fits(self, env: ManagerBasedRlEnv) -> None:
         """Refuse an environment with other observations or actions than those of the training.
@@ -197,13 +229,14 @@ class OnnxPolicy(torch.nn.Module):
         groups = self._named_groups() or ["actor"]
         return torch.cat([observations[name] for name in groups], dim=-1)
 
-    def _run(self, inputs: dict[str, torch.Tensor]) -> torch.Tensor:
+    def _run(self, inputs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Return the actions, and what is to be remembered, by name."""
         values = {**inputs, **self._integers}
         for name, key in self._names.items():
             values[name] = self._constants[key]
         for step in self._steps:
-            values[step.output] = step.compute(values)
-        return values[self._output]
+            values |= step.compute(values)
+        return {name: values[name] for name in (self._output, *self._memories.values())}
 
     def _compute_sizes(self) -> None:
         """Compute the whole numbers in the graph, which depend on shapes and not on values."""
@@ -212,15 +245,18 @@ class OnnxPolicy(torch.nn.Module):
             values[name] = self._constants[key]
         for name, shape in self.image_shapes.items():
             values[name] = torch.zeros(1, *shape)
+        for name, shape in self._memory_shapes.items():
+            values[name] = torch.zeros(shape)
         if self._state is not None:
             values[self._state] = torch.zeros(1, self.num_observations)
         remaining = []
         for step in self._steps:
-            value = values[step.output] = step.compute(values)
-            if value.is_floating_point():
+            results = step.compute(values)
+            values |= results
+            if any(value.is_floating_point() for value in results.values()):
                 remaining.append(step)
             else:
-                self._integers[step.output] = value
+                self._integers |= results
         self._steps = remaining
 
     def _find_output(self, graph: Any) -> Any:
@@ -239,7 +275,7 @@ class OnnxPolicy(torch.nn.Module):
 
         Of the inputs, only those among `needed` are looked at.
         """
-        asked = needed - {*self._names, *self._integers}
+        asked = needed - {*self._names, *self._integers, *self._memories}
         dims = {item.name: _dims(item) for item in graph.input if item.name in asked}
         flat = [name for name, size in dims.items() if len(size) == 2]
         images = {name: tuple(size[1:]) for name, size in dims.items() if len(size) == 4}
@@ -247,8 +283,8 @@ class OnnxPolicy(torch.nn.Module):
         if not understood:
             raise OnnxPolicyError(
                 f"The actions of the policy {self.path} depend on the inputs {list(dims)} of sizes "
-                f"{list(dims.values())}; one flat input and any number of images can be played "
-                "here. Play the checkpoint (model_<iteration>.pt) instead."
+                f"{list(dims.values())}; one flat input, any number of images and a memory (`h_in` "
+                "with an output `h_out`) can be played here. Play the checkpoint (model_<iteration>.pt) instead."
             )
         state = flat[0] if flat else None
         return state, 0 if state is None else dims[state][-1], images
@@ -265,14 +301,14 @@ class OnnxPolicy(torch.nn.Module):
         attributes = {item.name: attribute_value(item) for item in node.attribute}
         if node.op_type == "Constant":
             self._add_constant(node.output[0], attributes["value"])
-            return _Step(identity, (node.output[0],), node.output[0], {})
+            return _Step(identity, (node.output[0],), (node.output[0],), {})
         if node.op_type not in OPERATORS:
             raise OnnxPolicyError(
                 f"The policy {self.path} uses the operator {node.op_type}, which is not known "
                 f"here; known are {sorted(OPERATORS)}. Play the checkpoint "
                 "(model_<iteration>.pt) instead."
             )
-        return _Step(OPERATORS[node.op_type], tuple(node.input), node.output[0], attributes)
+        return _Step(OPERATORS[node.op_type], tuple(node.input), tuple(node.output), attributes)
 
 
 def load_onnx_policy(path: Path, env: Any, device: str) -> OnnxPolicy:
@@ -301,9 +337,9 @@ def _load(path: Path) -> Any:
     return model
 
 
-def _leading_to(output: str, nodes: Sequence[Any]) -> tuple[list[Any], set[str]]:
-    """Return the nodes from which `output` follows, in order, and the names of all that they read."""
-    needed, kept = {output}, []
+def _leading_to(outputs: set[str], nodes: Sequence[Any]) -> tuple[list[Any], set[str]]:
+    """Return the nodes from which `outputs` follow, in order, and the names of all that they read."""
+    needed, kept = set(outputs), []
     # The nodes of a graph are in the order in which they are computed.
     for node in reversed(nodes):
         if needed.intersection(node.output):

@@ -123,6 +123,7 @@ with _import_context:
     from rsl_rl.env import VecEnv as VecEnv
     from rsl_rl.models import CNNModel as CNNModel
     from rsl_rl.models import MLPModel as MLPModel
+    from rsl_rl.models import RNNModel as RNNModel
     from rsl_rl.modules import CNN as CNN
     from rsl_rl.modules.distribution import Distribution as Distribution
     from rsl_rl.runners import OnPolicyRunner as OnPolicyRunner

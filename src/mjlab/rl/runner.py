@@ -150,8 +150,14 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             RunFolderError: the run folder cannot be written to; raised before any training.
             CheckpointError: a checkpoint could not be written.
             DivergedError: training failed because the physics of a joint diverged.
-            ValueError: the environment returned NaN, or Weights & Biases started no run.
+            ValueError: the environment returned NaN, Weights & Biases started no run, or a student has
+                no teacher.
         """
+        if not getattr(self.alg, "teacher_loaded", True):
+            raise ValueError(
+                "Distillation: expected a teacher, got none; give its checkpoint by "
+                "--agent.teacher-checkpoint, or call load_teacher."
+            )
         first = self.current_learning_iteration
         if self._writes and self.logger.log_dir is not None:
             ensure_writable_folder(self.logger.log_dir)
@@ -294,7 +300,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             losses=losses,
             learning_rate=self.alg.learning_rate,
             action_std=self.alg.get_policy().output_std.detach(),
-            rnd_weight=self.alg.rnd.weight if self.alg.rnd else None,
+            rnd_weight=rnd.weight if (rnd := getattr(self.alg, "rnd", None)) else None,
         )
         self._tell("on_iteration", stats)
         return stats
@@ -421,7 +427,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
 
         Args:
             path: The file.
-            load_cfg: Which parts to load (`actor`, `critic`, `optimizer`, `iteration`, `rnd`);
+            load_cfg: Which parts to load (`actor`, `critic`, `student`, `teacher`, `optimizer`,
+                `iteration`, `rnd`);
                 None loads all, and `learn` then resumes the environments and the random number
                 generators too, if there are as many environments.
             strict: Whether every parameter has to fit.
@@ -452,10 +459,22 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self._observations = None
         return infos
 
+    def load_teacher(self, path: str) -> None:
+        """Load the teacher of a distillation: the policy of a checkpoint of PPO.
+
+        Raises:
+            CheckpointError: the file is missing, corrupt, hostile, malformed, or of another network.
+        """
+        checkpoint = migrate(load_checkpoint(path), str(path))
+        policy = checkpoint.get("actor_state_dict")
+        algorithm: Any = self.alg
+        check_fits(algorithm._raw_teacher, policy, name="teacher", path=str(path))
+        algorithm.load({"actor_state_dict": policy}, {"teacher": True}, strict=True)
+
     def _check_parts(
         self, checkpoint: Mapping[str, Any], load_cfg: dict | None, strict: bool, path: str
     ) -> None:
-        for name in ("actor", "critic"):
+        for name in ("actor", "critic", "student", "teacher"):
             model = getattr(self.alg, f"_raw_{name}", None)
             if strict and model is not None and (load_cfg is None or load_cfg.get(name)):
                 check_fits(model, checkpoint.get(f"{name}_state_dict"), name=name, path=path)

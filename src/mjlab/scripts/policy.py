@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.rl.config import RslRlBaseRunnerCfg, RslRlDistillationRunnerCfg
 from mjlab.rl.learners import Learner, acting_cfg
 from mjlab.scripts.cli import UserError, tell
 from mjlab.scripts.profiles import parse_with_choices, profile_of_run
@@ -159,10 +160,12 @@ def load_policy(
     from mjlab.rl import MjlabOnPolicyRunner
     from mjlab.rl.checkpoint import learner_of_checkpoint
 
-    agent_cfg = _agent_cfg(task, checkpoint, profile, learner_of_checkpoint(checkpoint))
+    learner = learner_of_checkpoint(checkpoint)
+    agent_cfg = _agent_cfg(task, checkpoint, profile, learner)
     runner_cls: Any = load_runner_cls(task) or MjlabOnPolicyRunner
     runner = runner_cls(env, agent_cfg, None, device)
-    runner.load(str(checkpoint), load_cfg={"actor": True}, strict=True, map_location=device)
+    network = "student" if learner == "distillation" else "actor"
+    runner.load(str(checkpoint), load_cfg={network: True}, strict=True, map_location=device)
     return runner.get_inference_policy(device=device)
 
 
@@ -175,14 +178,50 @@ def _agent_cfg(
     """
     cfg = acting_cfg(load_rl_cfg(task, profile=profile, learner=learner))
     saved = read_agent_params(checkpoint.parent)
-    for network in ("actor", "critic"):
-        settings = saved.get(network)
-        if not isinstance(settings, dict):
-            continue
-        for name, is_valid in _SETTINGS.items():
-            if name in settings and name in cfg[network] and is_valid(settings[name]):
-                cfg[network][name] = settings[name]
+    for network in ("actor", "critic", "student", "teacher"):
+        if network in cfg:
+            cfg[network] |= _saved_settings(saved, network, cfg[network])
     return cfg
+
+
+def _saved_settings(
+    saved: Mapping[str, Any], network: str, known: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return what a run's own settings say of a network, as far as it is `known` and valid."""
+    settings = saved.get(network)
+    if not isinstance(settings, dict):
+        return {}
+    return {
+        name: settings[name]
+        for name, is_valid in _SETTINGS.items()
+        if name in settings and name in known and is_valid(settings[name])
+    }
+
+
+def prepare_teacher(cfg: RslRlBaseRunnerCfg, resumed: Path | None) -> None:
+    """Give a distillation's teacher the network that it had in its run, or in the `resumed` one.
+
+    Raises:
+        UserError: the teacher was not trained by PPO.
+        CheckpointError: its checkpoint is missing or damaged.
+    """
+    if not isinstance(cfg, RslRlDistillationRunnerCfg):
+        return
+    path, network = cfg.teacher_checkpoint, "actor"
+    if resumed is not None:
+        path, network = str(resumed), "teacher"
+    elif path is not None:
+        from mjlab.rl.checkpoint import learner_of_checkpoint
+
+        learner = learner_of_checkpoint(path)
+        if learner != "ppo":
+            raise UserError(
+                f"--agent.teacher-checkpoint: expected a checkpoint of the learner 'ppo', got {path}, "
+                f"which {learner!r} wrote."
+            )
+    if path is not None:
+        saved = read_agent_params(Path(path).parent)
+        cfg.teacher = replace(cfg.teacher, **_saved_settings(saved, network, asdict(cfg.teacher)))
 
 
 def find_checkpoint(task: str, flags: PolicyFlags) -> Path | None:

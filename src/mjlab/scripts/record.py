@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from mjlab.scripts.policy import make_env, make_policy
+from mjlab.viewer.protocols import forget_ended
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -76,7 +77,7 @@ def record_policy(
         )
         with torch.inference_mode():
             for _ in range(video.length):
-                env.step(policy(env.get_observations()))
+                forget_ended(policy, env.step(policy(env.get_observations()))[2])
                 writer.add(env.unwrapped.render(video.camera))
         path = writer.close()
     finally:

@@ -20,6 +20,7 @@ _ALGORITHM_COUNTS = (
     "num_steps_return",
     "policy_delay",
     "noise_hold",
+    "gradient_length",
 )
 _SEPARATORS = ("/", "\\")
 

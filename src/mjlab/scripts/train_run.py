@@ -14,6 +14,7 @@ from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import RslRlBaseRunnerCfg
 from mjlab.rl.learners import Learner, learner_of
 from mjlab.rl.progress import TrainingObserver
+from mjlab.scripts.policy import prepare_teacher
 from mjlab.scripts.process_output import ProcessOutput, log_file, output_of
 from mjlab.scripts.profiles import parse_with_choices, suggest_profile
 from mjlab.scripts.resume import (
@@ -54,8 +55,9 @@ class TrainConfig:
     """Named settings of the task, such as `cpu`, that all other flags start from; `list-envs` shows
     which there are. None: the task's own, or where a run is resumed, that run's."""
     learner: Learner | None = None
-    """Learner, which decides what flags there are under --agent.: `ppo`, or `sac`, which learns from a
-    replay (soft actor-critic). None: that of the resumed run, else that of the profile or task."""
+    """Learner, which decides what flags there are under --agent.: `ppo`; `sac`, which learns from a
+    replay (soft actor-critic); or `distillation`, a student of --agent.teacher-checkpoint. None: that of
+    the resumed run, else that of the profile or task."""
     num_envs: int | None = None
     """Number of environments, of each process; short for --env.scene.num-envs."""
     device: str | None = None
@@ -166,14 +168,18 @@ def _train(
             env = _build_env(cfg, device, folder.path, rank)
         try:
             under = f", profile {cfg.profile}" if cfg.profile else ""
-            under += ", learner sac" if learner_of(cfg.agent) == "sac" else ""
+            learner = learner_of(cfg.agent)
+            under += "" if learner == "ppo" else f", learner {learner}"
             each = "" if rank.is_alone else f" in each of {rank.world_size} processes"
             print(f"Task:    {task}, {env.num_envs} environments{each}{under}")
             print(f"Physics: {env.unwrapped.sim.capabilities.description}", flush=True)
             with same_fate():
+                prepare_teacher(cfg.agent, checkpoint)
                 runner = _build_runner(task, cfg, env, folder.path, device)
                 if checkpoint is not None:
                     runner.load(str(checkpoint))
+                elif (teacher := getattr(cfg.agent, "teacher_checkpoint", None)) is not None:
+                    runner.load_teacher(teacher)
             if checkpoint is not None:
                 if is_finished(cfg, runner, checkpoint):
                     return checkpoint.parent

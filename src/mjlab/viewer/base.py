@@ -21,6 +21,7 @@ from mjlab.viewer.protocols import PolicyProtocol as PolicyProtocol
 from mjlab.viewer.protocols import VerbosityLevel as VerbosityLevel
 from mjlab.viewer.protocols import ViewerAction as ViewerAction
 from mjlab.viewer.protocols import ViewerStatus as ViewerStatus
+from mjlab.viewer.protocols import forget_ended
 
 log = logging.getLogger(__name__)
 
@@ -153,7 +154,7 @@ class BaseViewer(ABC):
         with self._pause_on_error("stepping the environment"), torch.no_grad():
             self.sync_viewer_to_env()
             actions = self.policy(self.env.get_observations())
-            self.env.step(actions)
+            forget_ended(self.policy, self.env.step(actions)[2])
             self._step_count += 1
             self._total_steps += 1
             self._rates.count(steps=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import inspect
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -46,10 +47,19 @@ class EnvProtocol(Protocol):
 class PolicyProtocol(Protocol):
     """Anything that turns observations into actions (num_envs, num_actions).
 
-    A policy with memory also has a method `reset()`, called when the environments are reset.
+    A policy with memory also has a method `reset()`, called when the environments are reset. Where it
+    is `reset(dones=None)`, it is also called after every step, with `dones` (num_envs,) not 0 where an
+    episode ended.
     """
 
     def __call__(self, obs: torch.Tensor) -> torch.Tensor: ...
+
+
+def forget_ended(policy: Any, dones: torch.Tensor) -> None:
+    """Let a policy with memory forget the environments whose episodes ended, `dones` (num_envs,)."""
+    reset = getattr(policy, "reset", None)
+    if callable(reset) and inspect.signature(reset).parameters:
+        reset(dones)
 
 
 class ViewerAction(enum.Enum):

@@ -1,0 +1,98 @@
+"""Tasks in Gymnasium's registry: importing this registers each as `mjlab/NAME`.
+
+```python
+import gymnasium
+import mjlab.gymnasium
+
+envs = gymnasium.make_vec("mjlab/Mjlab-Velocity-Flat-Unitree-Go1", num_envs=512)
+```
+
+Without the second import, `make_vec("mjlab.gymnasium:mjlab/Mjlab-Velocity-Flat-Unitree-Go1")` does the same.
+Needs Gymnasium (`pip install "mjlab[gymnasium]"`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import gymnasium
+
+from mjlab.tasks.registry import list_tasks
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnvCfg
+    from mjlab.rl.gymnasium_vector import GymnasiumVectorEnv
+
+logger = logging.getLogger(__name__)
+
+NAMESPACE = "mjlab"
+
+
+def register_tasks() -> None:
+    """Register all tasks that are not registered yet, such as those registered since the import."""
+    for task in list_tasks():
+        name = f"{NAMESPACE}/{task}"
+        if name in gymnasium.registry:
+            continue
+        try:
+            gymnasium.register(
+                name, vector_entry_point="mjlab.gymnasium:make_vec_env", kwargs={"task": task}
+            )
+        except gymnasium.error.Error as error:
+            logger.warning("Gymnasium cannot have the task %r: %s", task, error)
+
+
+def make_vec_env(
+    task: str,
+    num_envs: int = 1,
+    *,
+    play: bool = False,
+    profile: str | None = None,
+    device: str | None = None,
+    seed: int | None = None,
+    render_mode: str | None = None,
+    group: str | None = None,
+    clip_actions: float | None = None,
+    tensors: bool = False,
+    edit: Callable[[ManagerBasedRlEnvCfg], None] | None = None,
+) -> GymnasiumVectorEnv:
+    """Make the environments of a task; what `gymnasium.make_vec` calls, with its keyword arguments.
+
+    Args:
+        task: Name of the task.
+        num_envs: Number of environments.
+        play: Take the config to play with instead of the one to train with.
+        profile: One of the task's profiles.
+        device: Torch device; None: a GPU where there is one.
+        seed: Seed of the environment; `reset(seed=...)` sets another.
+        render_mode: `rgb_array`, or None.
+        group: See `mjlab.rl.gymnasium_env`.
+        clip_actions: See `mjlab.rl.gymnasium_env`.
+        tensors: See `mjlab.rl.gymnasium_env`.
+        edit: Function that changes the task's config before the environments are built.
+
+    Raises:
+        UnknownTaskError: no such task.
+        UnknownProfileError: no such profile.
+        ValueError: something is wrong with the config, the device or the group.
+    """
+    import torch
+
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.rl.gymnasium_vector import gymnasium_env
+    from mjlab.tasks.registry import load_env_cfg
+
+    cfg = load_env_cfg(task, play=play, profile=profile)
+    cfg.scene.num_envs = num_envs
+    if seed is not None:
+        cfg.seed = seed
+    if edit is not None:
+        edit(cfg)
+    device = device or ("cuda:0" if torch.cuda.is_available() else "cpu")
+    env = ManagerBasedRlEnv(cfg, device, render_mode)
+    return gymnasium_env(env, group, clip_actions, tensors)
+
+
+register_tasks()

@@ -1,0 +1,282 @@
+"""The environment as Gymnasium wants to see it: a vector environment, in NumPy or in torch.
+
+Needs Gymnasium (`pip install "mjlab[gymnasium]"`).
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from mjlab.envs.env_checks import as_action
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.managers.observation_manager import ObservationManager
+
+
+def gymnasium_env(
+    env: ManagerBasedRlEnv,
+    group: str | None = None,
+    clip_actions: float | None = None,
+    tensors: bool = False,
+) -> GymnasiumVectorEnv:
+    """Return `env` as a Gymnasium vector environment; closing that closes `env`.
+
+    Args:
+        env: The environment.
+        group: Observation group that is the observation. None: all groups, as a `Dict`.
+        clip_actions: Actions are clamped to plus and minus this, and the action space has these
+            bounds. None: neither.
+        tensors: Return torch tensors on the environment's device instead of NumPy arrays.
+
+    Raises:
+        ValueError: no such group, or `clip_actions` is not positive.
+    """
+    return GymnasiumVectorEnv(env, group, clip_actions, tensors)
+
+
+class GymnasiumVectorEnv(VectorEnv):
+    """A `ManagerBasedRlEnv` with Gymnasium's vector interface; see `gymnasium_env`.
+
+    Environments are reset in the step in which their episode ends (`AutoresetMode.SAME_STEP`), and
+    `infos` of that step have what the episode ended with, as Gymnasium's own vector environments:
+
+    - `final_obs`: object array (N,) with the last observation where an episode ended, None elsewhere.
+      Where the physics diverged it is the observation before the step.
+    - `final_info`: `episode_return` and `episode_length` (N,) of the episodes that ended.
+    - `_final_obs`, `_final_info`, and within `final_info` `_episode_return` and `_episode_length`: (N,) bool,
+      where an episode ended.
+
+    If the environment has `auto_reset=False`, nothing is reset (`AutoresetMode.DISABLED`); episodes that ended are
+    to be reset by `reset(options={"reset_mask": mask})`.
+
+    Of a task with `is_finite_horizon`, episodes that run out of time count as terminated.
+
+    Rewards (N,) are float32. Arrays belong to the caller: later steps do not write to them.
+    """
+
+    def __init__(
+        self,
+        env: ManagerBasedRlEnv,
+        group: str | None = None,
+        clip_actions: float | None = None,
+        tensors: bool = False,
+    ) -> None:
+        self.env = env
+        core = env.unwrapped
+        self.num_envs = core.num_envs
+        self.device = torch.device(core.device)
+        self.render_mode = env.render_mode
+        self._resets = core.cfg.auto_reset
+        self.metadata = {
+            "render_modes": ["rgb_array"],
+            "render_fps": core.metadata["render_fps"],
+            "autoreset_mode": AutoresetMode.SAME_STEP if self._resets else AutoresetMode.DISABLED,
+        }
+        self.single_observation_space = observation_space(core, group)
+        self.single_action_space = action_space(core, clip_actions)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._group, self._limit, self._tensors = group, clip_actions, tensors
+        self._returns = torch.zeros(self.num_envs, device=self.device)
+        self._observations: dict[str, Any] = {}
+        self._first_state: dict[str, Any] | None = None
+        core.observes_ends = core.observes_failures = self._resets
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start new episodes everywhere, or where `options["reset_mask"]` (N,) bool is true.
+
+        A `seed` starts all over: curricula and what else outlasts episodes are as they were at the
+        first `reset` with one, and every random number generator of the process (Python, NumPy,
+        torch) is seeded. What was randomized when the environment was built stays.
+
+        Raises:
+            ValueError: the mask has another shape or type, or a negative seed.
+        """
+        super().reset(seed=seed)
+        mask = torch.ones(self.num_envs, dtype=torch.bool)
+        if options is not None and "reset_mask" in options:
+            mask = torch.as_tensor(options["reset_mask"])
+            # Numbers would be taken for ids.
+            if mask.shape != (self.num_envs,) or mask.dtype != torch.bool:
+                raise ValueError(
+                    f"reset_mask: expected ({self.num_envs},) bool, got {tuple(mask.shape)} "
+                    f"{str(mask.dtype).removeprefix('torch.')}."
+                )
+        mask = mask.to(self.device)
+        if seed is not None:
+            self._start_over()
+        self._observations, _ = self.env.reset(seed=seed, env_ids=mask)
+        self._returns.masked_fill_(mask, 0.0)
+        return self._shown(self._observations), {}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Advance all environments by one step.
+
+        Args:
+            actions: (N, A), array or tensor.
+
+        Returns:
+            Observations, rewards (N,), terminations (N,) bool, truncations (N,) bool, infos.
+        """
+        actions = as_action(actions, self.env.unwrapped.device)
+        if self._limit is not None:
+            actions = actions.clamp(-self._limit, self._limit)
+        before = self._observations
+        lengths = self.env.unwrapped.episode_length_buf.clone()
+        self._observations, rewards, terminated, truncated, extras = self.env.step(actions)
+        self._returns += rewards
+        if self.env.unwrapped.cfg.is_finite_horizon:
+            terminated, truncated = terminated | truncated, torch.zeros_like(truncated)
+        infos: dict[str, Any] = {}
+        ended = terminated | truncated
+        if self._resets and ended.any():
+            self._add_ends(infos, ended, lengths + 1, before, extras)
+            self._returns.masked_fill_(ended, 0.0)
+        # The environment's own buffers are written to by the next step.
+        rewards, terminated, truncated = (
+            self._array(value.clone()) for value in (rewards, terminated, truncated)
+        )
+        return self._shown(self._observations), rewards, terminated, truncated, infos
+
+    def _start_over(self) -> None:
+        core = self.env.unwrapped
+        # Loading compares the shapes of observations, and writes into them: not into those that the
+        # caller has.
+        core.reset()
+        if self._first_state is None:
+            self._first_state = copy.deepcopy(core.state_dict())
+        core.load_state_dict(self._first_state)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Return the image of the view of all environments, as a tuple of one; None without a render mode."""
+        image = self.env.render()
+        return None if image is None else (image,)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the environment."""
+        self.env.close()
+
+    def _add_ends(
+        self,
+        infos: dict[str, Any],
+        ended: torch.Tensor,
+        lengths: torch.Tensor,
+        before: dict[str, Any],
+        extras: dict[str, Any],
+    ) -> None:
+        """Add to `infos` what the episodes of environments `ended` (N,) ended with."""
+        final = np.full(self.num_envs, None, dtype=object)
+        # What has no final observation diverged.
+        for row in ended.nonzero().flatten().tolist():
+            final[row] = self._shown(_rows(before, row))
+        ids = extras.get("final_ids", ())
+        for position, row in enumerate(ids.tolist() if len(ids) else ()):
+            final[row] = self._shown(_rows(extras["final_observations"], position))
+        mask = self._array(ended)
+        infos |= {
+            "final_obs": final,
+            "_final_obs": mask,
+            "final_info": {
+                "episode_return": self._array(torch.where(ended, self._returns, 0.0)),
+                "_episode_return": mask,
+                "episode_length": self._array(torch.where(ended, lengths, 0)),
+                "_episode_length": mask,
+            },
+            "_final_info": mask,
+        }
+
+    def _shown(self, observations: dict[str, Any]) -> Any:
+        """Return observations as they are given to the caller: those of the group, as arrays."""
+        if self._group is not None:
+            return self._arrays(observations[self._group])
+        return self._arrays(observations)
+
+    def _arrays(self, values: Any) -> Any:
+        if isinstance(values, dict):
+            return {name: self._arrays(value) for name, value in values.items()}
+        return self._array(values)
+
+    def _array(self, value: torch.Tensor) -> Any:
+        return value if self._tensors else value.cpu().numpy()
+
+
+# Spaces.
+
+
+def observation_space(env: ManagerBasedRlEnv, group: str | None = None) -> gymnasium.Space:
+    """Return the space of one environment's observations: a `Dict` of all groups, or one group's.
+
+    Bounds are those of terms with a `clip`, times their scale.
+
+    Raises:
+        ValueError: no such group.
+    """
+    manager = env.observation_manager
+    names = list(manager.active_terms)
+    if group is None:
+        return gymnasium.spaces.Dict({name: _group_space(manager, name) for name in names})
+    if group not in names:
+        raise ValueError(f"group: expected one of {names}, got {group!r}.")
+    return _group_space(manager, group)
+
+
+def action_space(env: ManagerBasedRlEnv, limit: float | None = None) -> gymnasium.spaces.Box:
+    """Return the space of one environment's actions (A,), within plus and minus `limit` if there is one.
+
+    Raises:
+        ValueError: `limit` is not positive.
+    """
+    if limit is not None and not limit > 0:
+        raise ValueError(f"clip_actions: expected a positive number or None, got {limit}.")
+    bound = np.inf if limit is None else limit
+    shape = (env.action_manager.total_action_dim,)
+    return gymnasium.spaces.Box(-bound, bound, shape, np.float32)
+
+
+def _group_space(manager: ObservationManager, group: str) -> gymnasium.Space:
+    shapes = manager.group_obs_term_dim[group]
+    terms = manager.active_terms[group]
+    bounds = [
+        _term_bounds(manager, group, term, shape) for term, shape in zip(terms, shapes, strict=True)
+    ]
+    if not manager.group_obs_concatenate[group]:
+        boxes = [gymnasium.spaces.Box(low, high, dtype=np.float32) for low, high in bounds]
+        return gymnasium.spaces.Dict(dict(zip(terms, boxes, strict=True)))
+    cfg = manager.cfg[group]
+    assert cfg is not None
+    axis = cfg.concatenate_dim
+    lows, highs = zip(*bounds, strict=True)
+    low, high = np.concatenate(lows, axis=axis), np.concatenate(highs, axis=axis)
+    return gymnasium.spaces.Box(low, high, dtype=np.float32)
+
+
+def _term_bounds(
+    manager: ObservationManager, group: str, term: str, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smallest and largest value of each entry of a term."""
+    cfg = manager.get_term_cfg(group, term)
+    if cfg.clip is None:
+        return np.full(shape, -np.inf, np.float32), np.full(shape, np.inf, np.float32)
+    scale = torch.as_tensor(1.0 if cfg.scale is None else cfg.scale).cpu().float().numpy()
+    if scale.ndim > 0 and shape[-1] != scale.shape[-1]:
+        # A flat history repeats the components.
+        scale = np.tile(scale, shape[-1] // scale.shape[-1])
+    ends = [np.broadcast_to(np.float32(end) * scale, shape) for end in cfg.clip]
+    return np.minimum(*ends), np.maximum(*ends)
+
+
+def _rows(values: dict[str, Any], row: int) -> dict[str, Any]:
+    return {
+        name: _rows(value, row) if isinstance(value, dict) else value[row]
+        for name, value in values.items()
+    }

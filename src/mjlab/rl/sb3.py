@@ -1,0 +1,121 @@
+"""The environment as Stable-Baselines3 wants to see it.
+
+Needs Stable-Baselines3 (`pip install "mjlab[sb3]"`). `examples/sb3_swing_up.py` trains with it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+
+from mjlab.rl.gymnasium_vector import gymnasium_env
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+
+
+class Sb3VecEnv(VecEnv):
+    """Adapts a `ManagerBasedRlEnv` to Stable-Baselines3's `VecEnv`.
+
+    Where an episode ends, observations are those of the next one, and the environment's info has
+    `terminal_observation`, `TimeLimit.truncated` (the episode ran out of time and did not terminate), and
+    `episode` with its return `r`, length `l` and the seconds `t` since this was made, which
+    Stable-Baselines3 logs. No `VecMonitor` is needed.
+    """
+
+    def __init__(
+        self,
+        env: ManagerBasedRlEnv,
+        group: str | None = "actor",
+        clip_actions: float = 100.0,
+    ) -> None:
+        """Adapt `env`.
+
+        Args:
+            env: The environment, with `auto_reset`.
+            group: Observation group that is the observation. None: all, for a `MultiInputPolicy`.
+            clip_actions: Actions are clamped to plus and minus this, and the action space has these
+                bounds, without which Stable-Baselines3 takes no environment. SAC and TD3 map their
+                range of actions to it: give them about 1.
+
+        Raises:
+            ValueError: no such group, `clip_actions` is not positive, or no `auto_reset`.
+        """
+        if not env.unwrapped.cfg.auto_reset:
+            raise ValueError("auto_reset: expected True, got False, which Stable-Baselines3 lacks.")
+        # First, because the constructor asks for attributes.
+        self.env = env
+        self._envs = gymnasium_env(env, group, clip_actions)
+        self._seed: int | None = None
+        self._actions: np.ndarray | None = None
+        self._begin = time.monotonic()
+        spaces = self._envs.single_observation_space, self._envs.single_action_space
+        super().__init__(env.unwrapped.num_envs, *spaces)
+
+    def reset(self) -> Any:
+        """Start new episodes in all environments; return their observations."""
+        observations, _ = self._envs.reset(seed=self._seed)
+        self._seed = None
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        return observations
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Set the seed of the next `reset`, one for all environments; return it for each."""
+        self._seed = super().seed(seed)[0]
+        return [self._seed] * self.num_envs
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions for `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Step; return observations, rewards (N,), dones (N,), and a dict for each environment."""
+        observations, rewards, terminated, truncated, infos = self._envs.step(self._actions)
+        each: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        dones = terminated | truncated
+        for row in dones.nonzero()[0].tolist():
+            ended = infos["final_info"]
+            each[row] = {
+                "terminal_observation": infos["final_obs"][row],
+                "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
+                "episode": {
+                    "r": float(ended["episode_return"][row]),
+                    "l": int(ended["episode_length"][row]),
+                    "t": round(time.monotonic() - self._begin, 6),
+                },
+            }
+        return observations, rewards, dones, each
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return an attribute of the environment, once for each of `indices`."""
+        return [getattr(self.env, attr_name)] * self._count(indices)
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of the environment, which is that of all."""
+        setattr(self.env, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of the environment once; return the result for each of `indices`."""
+        result = getattr(self.env, method_name)(*method_args, **method_kwargs)
+        return [result] * self._count(indices)
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """Return False for each of `indices`."""
+        return [False] * self._count(indices)
+
+    def get_images(self) -> list[np.ndarray | None]:
+        """Return the image of the view of all environments, as a list of one."""
+        return [self.env.render()]
+
+    def close(self) -> None:
+        """Close the environment."""
+        self._envs.close()
+
+    def _count(self, indices: None | int | Iterable[int]) -> int:
+        return len(self._get_indices(indices))

@@ -1,0 +1,151 @@
+"""The environment as skrl wants to see it.
+
+Needs skrl (`pip install "mjlab[skrl]"`). `examples/skrl_swing_up.py` trains with it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import torch
+from skrl.envs.wrappers.torch import Wrapper
+
+from mjlab.rl.gymnasium_vector import action_space, observation_space
+
+if TYPE_CHECKING:
+    from skrl.agents.torch import Agent
+
+    from mjlab.envs import ManagerBasedRlEnv
+
+
+class SkrlEnv(Wrapper):
+    """Adapts a `ManagerBasedRlEnv` to skrl's `Wrapper`, with tensors on the environment's device.
+
+    Environments are reset in the step in which their episode ends. The observations that episodes
+    ended with are in the infos of that step, for agents made by `with_final_observations`.
+    """
+
+    def __init__(
+        self,
+        env: ManagerBasedRlEnv,
+        group: str = "actor",
+        state_group: str | None = None,
+        clip_actions: float | None = None,
+    ) -> None:
+        """Adapt `env`.
+
+        Args:
+            env: The environment, with `auto_reset`.
+            group: Observation group that policies see.
+            state_group: Observation group that critics see (skrl's state); None: there is no state.
+            clip_actions: Actions are clamped to plus and minus this, and the action space has these
+                bounds. None: neither.
+
+        Raises:
+            ValueError: no such group, `clip_actions` is not positive, or no `auto_reset`.
+        """
+        super().__init__(env)
+        core = env.unwrapped
+        if not core.cfg.auto_reset:
+            raise ValueError("auto_reset: expected True, got False, which skrl's trainers lack.")
+        self._group, self._state_group, self._limit = group, state_group, clip_actions
+        self._observation_space = observation_space(core, group)
+        self._state_space = observation_space(core, state_group) if state_group else None
+        self._action_space = action_space(core, clip_actions)
+        self._observations: dict[str, Any] | None = None
+        core.observes_ends = core.observes_failures = True
+
+    @property
+    def observation_space(self) -> gymnasium.Space:
+        """Space of one environment's observations."""
+        return self._observation_space
+
+    @property
+    def state_space(self) -> gymnasium.Space | None:
+        """Space of what critics see in one environment; None without a state."""
+        return self._state_space
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        """Space of one environment's actions."""
+        return self._action_space
+
+    def reset(self) -> tuple[torch.Tensor, dict[str, Any]]:
+        """Reset all environments at the first call, and return the last observations afterwards."""
+        if self._observations is None:
+            self._observations, _ = self._env.reset()
+        return self._observations[self._group], {}
+
+    def step(
+        self, actions: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, Any]:
+        """Step all environments.
+
+        Args:
+            actions: Shape (N, A).
+
+        Returns:
+            Observations; rewards, terminated and truncated (N, 1); infos.
+        """
+        if self._limit is not None:
+            actions = actions.clamp(-self._limit, self._limit)
+        self._observations, rewards, terminated, truncated, extras = self._env.step(actions)
+        if self._unwrapped.cfg.is_finite_horizon:
+            terminated, truncated = terminated | truncated, torch.zeros_like(truncated)
+        infos: dict[str, Any] = {"log": dict(extras["log"])}
+        if "final_ids" in extras:
+            final = extras["final_observations"]
+            infos["final_ids"] = extras["final_ids"]
+            infos["final_observations"] = final[self._group]
+            infos["final_states"] = final[self._state_group] if self._state_group else None
+        # The environment's own buffers are written to by the next step.
+        rewards, terminated, truncated = (
+            value.clone().view(-1, 1) for value in (rewards, terminated, truncated)
+        )
+        return self._observations[self._group], rewards, terminated, truncated, infos
+
+    def state(self) -> torch.Tensor | None:
+        """Return what critics see, (N, ...); None without a state."""
+        if self._state_group is None or self._observations is None:
+            return None
+        return self._observations[self._state_group]
+
+    def render(self, *args: Any, **kwargs: Any) -> Any:
+        """Return the image of the view of all environments, or None without a render mode."""
+        return self._env.render()
+
+    def close(self) -> None:
+        """Close the environment."""
+        self._env.close()
+
+
+def with_final_observations(agent: type[Agent]) -> type[Agent]:
+    """Return a subclass of a class of agents that records the observations episodes ended with.
+
+    skrl's trainers pass on what `step` returns, which is the first observation of the next episode where
+    one ended. With `time_limit_bootstrap`, an agent would take its value for that of the end.
+    """
+
+    class WithFinalObservations(agent):
+        def record_transition(
+            self, *, next_observations: Any, next_states: Any, infos: Any, **rest: Any
+        ) -> None:
+            if "final_ids" in infos:
+                ids = infos["final_ids"]
+                next_observations = _replaced(next_observations, ids, infos["final_observations"])
+                next_states = _replaced(next_states, ids, infos["final_states"])
+            super().record_transition(
+                next_observations=next_observations, next_states=next_states, infos=infos, **rest
+            )
+
+    WithFinalObservations.__name__ = agent.__name__
+    return WithFinalObservations
+
+
+def _replaced(values: Any, ids: torch.Tensor, rows: Any) -> Any:
+    if values is None or rows is None:
+        return values
+    values = values.clone()
+    values[ids] = rows
+    return values

@@ -1,0 +1,314 @@
+"""Checks of a Gymnasium vector environment against what Gymnasium says of them.
+
+Gymnasium's `check_env` is for single environments. This one is for any `VectorEnv`, not only those of
+mjlab.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space, iterate
+
+_FINAL = ("final_obs", "final_info")
+
+
+class VectorEnvError(AssertionError):
+    """Raised for a vector environment that breaks Gymnasium's interface; the text names all faults."""
+
+
+def check_vector_env(
+    env: VectorEnv, steps: int = 100, seed: int = 0, action_limit: float = 1.0
+) -> None:
+    """Raise VectorEnvError, with all faults, unless `env` keeps to Gymnasium's vector interface.
+
+    It resets and steps the environment with random actions. Checked are spaces, shapes, types and bounds;
+    that one seed gives one trajectory; that arrays which were returned are left alone; what happens where
+    an episode ends, by the autoreset mode; and masks of infos.
+
+    Args:
+        env: The environment. It is not closed.
+        steps: Steps, in which some episode has to end.
+        seed: Seed of the environment and of the actions.
+        action_limit: Bound of random actions where the space has none.
+
+    Raises:
+        VectorEnvError: something is wrong.
+        ValueError: no episode ended.
+    """
+    check = _Check(env, action_limit)
+    first = check.run(steps, seed)
+    if not check.faults:
+        if not any(ended.any() for ended in check.ends):
+            raise ValueError(
+                f"No episode ended in {steps} steps, so that resets were not checked; use more steps "
+                "or shorter episodes."
+            )
+        second = check.run(steps, seed)
+        for step, (one, other) in enumerate(zip(first, second, strict=True)):
+            if not _same(one, other):
+                check.fault("seed", f"two runs with seed {seed} differ from step {step} on")
+                break
+    if check.faults:
+        found = "\n".join(f"- {kind}: {text}" for kind, text in check.faults.items())
+        raise VectorEnvError(f"{env} is no proper vector environment:\n{found}")
+
+
+class _Check:
+    """Runs of one environment, and the faults that they showed: the first of each kind."""
+
+    def __init__(self, env: VectorEnv, action_limit: float) -> None:
+        self.env = env
+        self.faults: dict[str, str] = {}
+        self.ends: list[np.ndarray] = []
+        self._limit = action_limit
+        self._mode: AutoresetMode | None = None
+
+    def fault(self, kind: str, text: str) -> None:
+        self.faults.setdefault(kind, text)
+
+    def run(self, steps: int, seed: int) -> list[Any]:
+        """Reset and step; return copies of all that was returned, as far as nothing was wrong."""
+        self._check_attributes()
+        self.ends = []
+        if self.faults:
+            return []
+        env, returned = self.env, []
+        actions = _bounded(env.action_space, self._limit)
+        actions.seed(seed)
+        result = env.reset(seed=seed)
+        if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
+            self.fault("reset", f"expected (observations, infos), got {_kind(result)}")
+            return []
+        observations, infos = result
+        self._check_observations("reset", observations)
+        self._check_masks(infos)
+        ended = np.zeros(env.num_envs, dtype=bool)
+        kept = observations, _copied(observations)
+        returned.append(kept[1])
+        stale, unreset = _Always(), _Always()
+        for _ in range(steps):
+            if self._mode is AutoresetMode.DISABLED and ended.any():
+                observations, _ = env.reset(options={"reset_mask": ended})
+                kept = observations, _copied(observations)
+            result = env.step(actions.sample())
+            if not (isinstance(result, tuple) and len(result) == 5 and isinstance(result[4], dict)):
+                self.fault("step", f"expected five results, the last a dict, got {_kind(result)}")
+                return []
+            if not _same(*kept):
+                self.fault(
+                    "aliasing",
+                    "observations that were returned are changed by the next step; return copies",
+                )
+            self._check_step(result, ended)
+            if self.faults:
+                return []
+            before, ended_before = kept[1], ended
+            observations, rewards, terminated, truncated, infos = result
+            ended = _array(terminated) | _array(truncated)
+            self.ends.append(ended)
+            kept = observations, _copied(observations)
+            returned.append(_copied(result[:4]))
+            if self._mode is AutoresetMode.SAME_STEP:
+                self._check_final(infos, ended, _array(terminated), before, kept[1], stale, unreset)
+            if self._mode is AutoresetMode.NEXT_STEP:
+                self._check_next_step(rewards, ended, ended_before)
+        if stale:
+            self.fault("stale final_obs", "it is the observation before the last step")
+        if unreset:
+            self.fault("reset", "final_obs is what step returns: environments go on unreset")
+        return returned
+
+    def _check_attributes(self) -> None:
+        env = self.env
+        mode = env.metadata.get("autoreset_mode")
+        if not isinstance(mode, AutoresetMode):
+            self.fault(
+                "autoreset_mode",
+                f"expected metadata['autoreset_mode'] of {list(AutoresetMode)}, got {mode!r}",
+            )
+        else:
+            self._mode = mode
+        if not isinstance(env.num_envs, int) or env.num_envs < 1:
+            self.fault("num_envs", f"expected a positive integer, got {env.num_envs!r}")
+            return
+        for name in ("observation_space", "action_space"):
+            single, batched = getattr(env, f"single_{name}"), getattr(env, name)
+            if not isinstance(single, gymnasium.Space):
+                self.fault(f"single_{name}", f"expected a gymnasium Space, got {_kind(single)}")
+            elif batched != batch_space(single, env.num_envs):
+                self.fault(
+                    name, f"expected batch_space(single_{name}, {env.num_envs}), got {batched}"
+                )
+
+    def _check_observations(self, where: str, observations: Any) -> None:
+        for text in _mismatches(self.env.observation_space, observations, "observations"):
+            self.fault("observations", f"{text}, in {where}")
+
+    def _check_step(self, result: tuple[Any, ...], ended_before: np.ndarray) -> None:
+        observations, rewards, terminated, truncated, infos = result
+        self._check_observations("step", observations)
+        shape = (self.env.num_envs,)
+        for name, value, kinds in (
+            ("rewards", rewards, "f"),
+            ("terminations", terminated, "b"),
+            ("truncations", truncated, "b"),
+        ):
+            wanted = "floats" if kinds == "f" else "bool"
+            if not isinstance(value, np.ndarray | torch.Tensor):
+                self.fault(name, f"expected an array {shape} of {wanted}, got {_kind(value)}")
+                continue
+            array = _array(value)
+            if array.shape != shape or array.dtype.kind not in kinds:
+                self.fault(
+                    name, f"expected {shape} of {wanted}, got {array.shape} of {array.dtype}"
+                )
+            elif kinds == "f" and not np.isfinite(array).all():
+                self.fault(name, "expected finite numbers")
+        self._check_masks(infos)
+
+    def _check_masks(self, infos: dict[str, Any], path: str = "infos") -> None:
+        """Check that each entry has its mask, and one value for each environment."""
+        for name, value in infos.items():
+            if name.startswith("_"):
+                continue
+            mask = infos.get(f"_{name}")
+            label = f"{path}[{name!r}]"
+            if not (
+                isinstance(mask, np.ndarray | torch.Tensor)
+                and tuple(mask.shape) == (self.env.num_envs,)
+                and _array(mask).dtype == np.bool_
+            ):
+                self.fault(
+                    "infos", f"expected a mask ({self.env.num_envs},) bool '_{name}' of {label}"
+                )
+            if isinstance(value, dict):
+                self._check_masks(value, label)
+            elif len(getattr(value, "shape", ())) < 1 or value.shape[0] != self.env.num_envs:
+                self.fault("infos", f"expected an array of {self.env.num_envs} values in {label}")
+
+    def _check_final(
+        self,
+        infos: dict[str, Any],
+        ended: np.ndarray,
+        terminated: np.ndarray,
+        before: Any,
+        after: Any,
+        stale: _Always,
+        unreset: _Always,
+    ) -> None:
+        """Check what a step that resets says of the episodes that ended in it."""
+        for name in _FINAL:
+            mask = infos.get(f"_{name}")
+            shown = np.zeros_like(ended) if mask is None else _array(mask)
+            if not np.array_equal(shown, ended):
+                self.fault(
+                    name,
+                    f"expected infos['_{name}'] to be true where an episode ended "
+                    f"({np.flatnonzero(ended).tolist()}), got {np.flatnonzero(shown).tolist()}",
+                )
+                return
+        if not ended.any():
+            return
+        final = infos["final_obs"]
+        if not (isinstance(final, np.ndarray) and final.dtype == object):
+            self.fault("final_obs", f"expected an object array, got {_kind(final)}")
+            return
+        if any(final[row] is not None for row in np.flatnonzero(~ended)):
+            self.fault("final_obs", "expected None where no episode ended")
+        single = self.env.single_observation_space
+        every_before = list(iterate(self.env.observation_space, before))
+        every_after = list(iterate(self.env.observation_space, after))
+        for row in np.flatnonzero(ended):
+            for text in _mismatches(single, final[row], "final_obs"):
+                self.fault("final_obs", text)
+                return
+            stale.see(terminated[row], _same(final[row], every_before[row]))
+            unreset.see(terminated[row], _same(final[row], every_after[row]))
+
+    def _check_next_step(self, rewards: Any, ended: np.ndarray, before: np.ndarray) -> None:
+        """Check that a step after the end of an episode only resets."""
+        if before.any() and (_array(rewards)[before] != 0).any():
+            self.fault("autoreset", "expected reward 0 in the step after an end, which only resets")
+        if (ended & before).any():
+            self.fault("autoreset", "an episode ends in the step that only resets")
+
+
+class _Always:
+    """Whether something was true at every end of episodes of one kind: terminations or time-outs."""
+
+    def __init__(self) -> None:
+        self._seen: dict[bool, list[bool]] = {}
+
+    def see(self, terminated: bool, value: bool) -> None:
+        self._seen.setdefault(terminated, []).append(value)
+
+    def __bool__(self) -> bool:
+        return any(map(all, self._seen.values()))
+
+
+def _bounded(space: gymnasium.Space, limit: float) -> gymnasium.Space:
+    """Return `space` with bounds to draw from: unbounded ones draw far beyond what a robot can do."""
+    if not isinstance(space, gymnasium.spaces.Box):
+        return space
+    low, high = np.maximum(space.low, -limit), np.minimum(space.high, limit)
+    outside = low > high
+    low, high = np.where(outside, space.low, low), np.where(outside, space.high, high)
+    return gymnasium.spaces.Box(
+        low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype
+    )
+
+
+def _mismatches(space: gymnasium.Space, value: Any, label: str) -> Iterator[str]:
+    """Yield, one text each, where `value` is not of `space`."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        if not isinstance(value, dict) or set(value) != set(space):
+            found = sorted(value) if isinstance(value, dict) else _kind(value)
+            yield f"{label}: expected a dict of {sorted(space)}, got {found}"
+            return
+        for name, inner in space.items():
+            yield from _mismatches(inner, value[name], f"{label}[{name!r}]")
+        return
+    if isinstance(value, torch.Tensor):
+        value = _array(value)
+    if not isinstance(value, np.ndarray) and space.shape is not None:
+        yield f"{label}: expected an array {space.shape}, got {_kind(value)}"
+    elif isinstance(value, np.ndarray) and (value.shape, value.dtype) != (space.shape, space.dtype):
+        yield (
+            f"{label}: expected {space.shape} of {space.dtype}, got {value.shape} of {value.dtype}"
+        )
+    elif isinstance(value, np.ndarray) and value.dtype.kind == "f" and not np.isfinite(value).all():
+        yield f"{label}: expected finite numbers"
+    elif not space.contains(value):
+        yield f"{label}: values are outside of the bounds of the space"
+
+
+def _array(value: Any) -> np.ndarray:
+    return value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _copied(inner) for name, inner in value.items()}
+    if isinstance(value, tuple):
+        return tuple(_copied(inner) for inner in value)
+    return np.array(_array(value))
+
+
+def _same(one: Any, other: Any) -> bool:
+    if isinstance(one, dict):
+        return all(_same(one[name], other[name]) for name in one)
+    if isinstance(one, tuple):
+        return all(map(_same, one, other))
+    return np.array_equal(_array(one), _array(other), equal_nan=_array(one).dtype.kind == "f")
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"a tuple of {len(value)}"
+    return f"a {type(value).__name__}"

@@ -1,0 +1,108 @@
+"""A student learns to act as a trained teacher does."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from rl_fake_env import FakeEnv, FakeEnvCfg, runner_cfg
+
+from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
+from mjlab.rl.checkpoint import CheckpointError
+from mjlab.rl.config import (
+    RslRlDistillationAlgorithmCfg,
+    RslRlDistillationRunnerCfg,
+    RslRlModelCfg,
+    gaussian_distribution,
+)
+
+
+@pytest.fixture(scope="module")
+def teacher(tmp_path_factory) -> Path:
+    """Return the checkpoint of a policy of PPO."""
+    folder = tmp_path_factory.mktemp("teacher")
+    torch.manual_seed(1)
+    MjlabOnPolicyRunner(RslRlVecEnvWrapper(FakeEnv(FakeEnvCfg())), runner_cfg(), str(folder)).learn(
+        3
+    )
+    return folder / "model_2.pt"
+
+
+def student_runner(folder: Path | None = None, **of_student: Any) -> MjlabOnPolicyRunner:
+    student = {"hidden_dims": (16,), "distribution_cfg": gaussian_distribution(0.3), **of_student}
+    cfg = RslRlDistillationRunnerCfg(
+        num_steps_per_env=6,
+        save_interval=2,
+        obs_groups={"student": ("critic",), "teacher": ("actor",)},
+        student=RslRlModelCfg(**student),
+        teacher=RslRlModelCfg(
+            hidden_dims=(8,), obs_normalization=True, distribution_cfg=gaussian_distribution()
+        ),
+        algorithm=RslRlDistillationAlgorithmCfg(gradient_length=3, learning_rate=1e-2),
+    )
+    env = RslRlVecEnvWrapper(FakeEnv(FakeEnvCfg()))
+    return MjlabOnPolicyRunner(env, asdict(cfg), None if folder is None else str(folder))
+
+
+def test_the_student_acts_as_the_teacher_in_the_end(teacher):
+    torch.manual_seed(2)
+    runner = student_runner()
+    runner.load_teacher(str(teacher))
+    observations = runner.env.get_observations()
+
+    def distance() -> float:
+        shown = runner.alg.teacher(observations)
+        return (runner.alg.get_policy()(observations) - shown).square().mean().item()
+
+    before = distance()
+    weights = {k: v.clone() for k, v in runner.alg.teacher.state_dict().items()}
+    runner.learn(60)
+    assert distance() < 0.05 * before
+    for name, value in runner.alg.teacher.state_dict().items():
+        assert torch.equal(value, weights[name])
+
+
+@pytest.mark.parametrize(
+    "of_student", [{}, {"class_name": "RNNModel", "rnn_type": "lstm", "rnn_hidden_dim": 4}]
+)
+def test_a_resumed_run_takes_the_same_course(teacher, tmp_path, of_student):
+    torch.manual_seed(3)
+    whole = student_runner(**of_student)
+    whole.load_teacher(str(teacher))
+    whole.learn(6)
+
+    torch.manual_seed(3)
+    first = student_runner(tmp_path, **of_student)
+    first.load_teacher(str(teacher))
+    first.learn(3)
+    torch.manual_seed(99)
+    second = student_runner(tmp_path, **of_student)
+    # The checkpoint has the teacher too.
+    second.load(str(tmp_path / "model_2.pt"))
+    second.learn(6)
+    expected, found = (runner.alg.student.state_dict() for runner in (whole, second))
+    assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
+def test_without_a_teacher_nothing_is_learned(tmp_path):
+    with pytest.raises(ValueError, match="expected a teacher, got none; give its checkpoint by"):
+        student_runner(tmp_path).learn(1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_teacher_of_another_network_is_refused(teacher, tmp_path):
+    runner = student_runner(tmp_path)
+    runner.alg._raw_teacher.mlp = torch.nn.Linear(2, 2)
+    with pytest.raises(CheckpointError, match="its teacher does not fit this task's teacher"):
+        runner.load_teacher(str(teacher))
+    runner = student_runner(tmp_path)
+    with pytest.raises(CheckpointError, match="holds no student weights"):
+        runner.load(str(teacher))
+
+
+def test_a_student_without_a_deviation_is_refused():
+    with pytest.raises(ValueError, match="agent.student distribution_cfg: expected a distribution"):
+        student_runner(distribution_cfg=None)

@@ -1,0 +1,64 @@
+"""Distillation by command: a teacher of PPO, then its student."""
+
+from __future__ import annotations
+
+import pytest
+import yaml
+from commands import SMALL, TASK
+
+from mjlab.scripts.run_folder import checkpoints_in
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
+
+STUDENT = ("--learner", "distillation")
+
+
+@pytest.fixture(scope="module")
+def student(run, train, tmp_path_factory):
+    """Return the runs of a teacher of another size than the task's, and of its student."""
+    logs = tmp_path_factory.mktemp("distillation") / "logs"
+    teacher = train(logs, 2, "--agent.actor.hidden-dims", "16,24")
+    checkpoint = str(checkpoints_in(teacher)[-1])
+    return teacher, train(logs, 2, *STUDENT, "--agent.teacher-checkpoint", checkpoint)
+
+
+def test_the_teacher_has_the_network_of_its_run(student):
+    agent = yaml.safe_load((student[1] / "params" / "agent.yaml").read_text())
+    assert agent["teacher"]["hidden_dims"] == [16, 24]
+    assert agent["student"]["hidden_dims"] == [64, 64]
+
+
+def test_a_student_is_resumed_evaluated_and_played_from_both_files(run, train, student):
+    logs = student[1].parents[1]
+    argv = ["--log-root", str(logs), "--device", "cpu"]
+    resumed = train(logs, 3, "--agent.resume", "True", "--agent.load-run", student[1].name)
+    outputs = []
+    for path in (checkpoints_in(resumed)[-1], next(resumed.glob("*.onnx"))):
+        flags = ["--checkpoint-file", str(path), "--num-episodes", "4", "--seed", "3"]
+        outcome = run("evaluate", TASK, *argv, *flags, "--env.episode-length-s", "2")
+        assert outcome.status == 0, outcome.err
+        outputs.append(next(line for line in outcome.out.splitlines() if "eturn" in line))
+    assert outputs[0] == outputs[1]
+
+
+def test_a_teacher_that_ppo_did_not_train_is_refused(run, student, tmp_path):
+    argv = [TASK, *SMALL, "--log-root", str(tmp_path), *STUDENT, "--agent.teacher-checkpoint"]
+    outcome = run("train", *argv, str(checkpoints_in(student[1])[-1]))
+    assert outcome.status == 1
+    assert "expected a checkpoint of the learner 'ppo'" in outcome.message
+
+
+def test_a_student_without_a_teacher_is_told_so(run, tmp_path):
+    outcome = run("train", TASK, *SMALL, "--log-root", str(tmp_path), *STUDENT)
+    assert outcome.status == 1
+    assert "expected a teacher, got none" in outcome.message
+    assert not list(tmp_path.glob("*/*"))
+
+
+def test_the_blind_student_of_rough_ground_sees_all_but_the_ground():
+    task = "Mjlab-Velocity-Rough-Unitree-Go1"
+    groups = load_env_cfg(task, profile="blind").observations
+    assert set(groups["actor"].terms) - set(groups["student"].terms) == {"height_scan"}
+    cfg = load_rl_cfg(task, profile="blind")
+    assert cfg.obs_groups == {"student": ("student",), "teacher": ("actor",)}
+    teacher = load_rl_cfg(task, profile="cpu").actor
+    assert cfg.teacher == teacher
