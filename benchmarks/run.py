@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import adapters
 import cameras
 import engines_agree
 import growth
@@ -32,7 +33,7 @@ def main() -> None:
     if before is not None:
         rows += side_by_side.measure(before.resolve())
         write(rows)
-    quick = (throughput, tasks, growth, cameras, reach, startup, repeatability)
+    quick = (throughput, tasks, adapters, growth, cameras, reach, startup, repeatability)
     for benchmark in (*quick, learning, live_view, walking, engines_agree):
         print(f"{benchmark.__name__} ...", flush=True)
         rows += benchmark.measure()

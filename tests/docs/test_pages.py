@@ -20,7 +20,7 @@ PAGES = [
     for page in sorted((ROOT / "docs" / folder).glob("*.md"))
 ]
 
-_COMMAND = re.compile(r"\buv run (?:--\S+ )*([\w-]+)")
+_COMMAND = re.compile(r"\buv run (?:--extra \S+ |--\S+ )*([\w-]+)")
 _FLAG = re.compile(r"(?<![\w-])--([a-z][\w.-]*[a-z])")
 _OBJECT = re.compile(r"^\.\. auto\w+:: (\S+)$", re.MULTILINE)
 _COMMAND_LINE = re.compile(
@@ -74,12 +74,15 @@ def _flags_of() -> dict[str, list[object]]:
     from mjlab.tasks.tracking.options import MotionOptions
 
     train = TrainConfig.from_task("Mjlab-Cartpole-Swingup")
-    sac = TrainConfig.from_task("Mjlab-Cartpole-Swingup", learner="sac")
+    others = [
+        TrainConfig.from_task("Mjlab-Cartpole-Swingup", learner=learner)
+        for learner in ("sac", "distillation")
+    ]
     play = PlayConfig(env=train.env)
     return {
         # With the flags that motion tracking brings itself.
-        "train": [train, sac, MotionOptions()],
-        "train-seeds": [train, sac, {"seeds": None}],
+        "train": [train, *others, MotionOptions()],
+        "train-seeds": [train, *others, {"seeds": None}],
         "demo": [play],
         "play": [play, MotionOptions()],
         "evaluate": [EvaluateConfig(env=train.env), MotionOptions()],

@@ -11,13 +11,13 @@ import torch
 
 pytest.importorskip("stable_baselines3")
 
-from stable_baselines3 import PPO, SAC  # noqa: E402
-from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.vec_env import VecNormalize
 
-from mjlab.envs import ManagerBasedRlEnv  # noqa: E402
-from mjlab.managers import TerminationTermCfg  # noqa: E402
-from mjlab.rl.sb3 import Sb3VecEnv  # noqa: E402
-from mjlab.tasks.registry import load_env_cfg  # noqa: E402
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.managers import TerminationTermCfg
+from mjlab.rl.sb3 import Sb3VecEnv
+from mjlab.tasks.registry import load_env_cfg
 
 NUM_ENVS = 3
 

@@ -12,12 +12,12 @@ import torch
 
 pytest.importorskip("skrl")
 
-from skrl.agents.torch import Agent  # noqa: E402
+from skrl.agents.torch import Agent
 
-from mjlab.envs import ManagerBasedRlEnv  # noqa: E402
-from mjlab.managers import TerminationTermCfg  # noqa: E402
-from mjlab.rl.skrl import SkrlEnv, with_final_observations  # noqa: E402
-from mjlab.tasks.registry import load_env_cfg  # noqa: E402
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.managers import TerminationTermCfg
+from mjlab.rl.skrl import SkrlEnv, with_final_observations
+from mjlab.tasks.registry import load_env_cfg
 
 NUM_ENVS = 3
 

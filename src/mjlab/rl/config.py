@@ -8,6 +8,9 @@ from typing import Any, Literal
 
 from mjlab.compat import accepts_older_fields
 
+TorchCompileMode = Literal["default", "max-autotune-no-cudagraphs"]
+"""Modes of `torch.compile` that rsl_rl's algorithms can have."""
+
 
 def gaussian_distribution(init_std: float = 1.0) -> dict[str, Any]:
     """Return a `distribution_cfg`: normal, with one learned deviation for each action."""
@@ -78,6 +81,8 @@ class RslRlPpoAlgorithmCfg:
     """Learning from mirror images too: `{"data_augmentation_func": "module:function",
     "use_data_augmentation": True}`, as rsl_rl has it. `mjlab.tasks.velocity.symmetry:mirror_left_right`
     is such a function. None: only what was seen."""
+    use_mixed_precision: bool = field(default=False, kw_only=True)
+    """Mixed precision: bfloat16 in the networks while learning."""
     class_name: str = "PPO"
     """A class of rsl_rl, or `module:Class`."""
 
@@ -265,6 +270,8 @@ class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
     """The value network."""
     algorithm: RslRlPpoAlgorithmCfg = field(default_factory=RslRlPpoAlgorithmCfg)
     """The learning algorithm."""
+    torch_compile_mode: TorchCompileMode | None = field(default=None, kw_only=True)
+    """Networks compiled by `torch.compile`, which takes its time at the start; None does not."""
 
 
 @dataclass
@@ -312,6 +319,8 @@ class RslRlDistillationRunnerCfg(RslRlBaseRunnerCfg):
     """The learning algorithm."""
     teacher_checkpoint: str | None = None
     """Checkpoint of the teacher, trained with PPO. A resumed run has its teacher already."""
+    torch_compile_mode: TorchCompileMode | None = None
+    """Networks compiled by `torch.compile`, which takes its time at the start; None does not."""
 
 
 def squashed_gaussian(init_std: float = 0.15, log_std_max: float = 0.0) -> dict[str, Any]:

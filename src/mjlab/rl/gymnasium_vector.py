@@ -80,6 +80,8 @@ class GymnasiumVectorEnv(VectorEnv):
             "render_fps": core.metadata["render_fps"],
             "autoreset_mode": AutoresetMode.SAME_STEP if self._resets else AutoresetMode.DISABLED,
         }
+        # TorchRL looks for it where Gymnasium's own vector environments have it.
+        self.autoreset_mode = self.metadata["autoreset_mode"]
         self.single_observation_space = observation_space(core, group)
         self.single_action_space = action_space(core, clip_actions)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
