@@ -1,4 +1,4 @@
-"""What the Gymnasium environment costs over `env.step`: the same environment, in turns.
+"""Overhead of the Gymnasium environment over `env.step`: the same environment, in turns.
 
 Ends of episodes are spread over all steps, as in training. With `final observations`, `env.step` observes episodes
 as they end, which the Gymnasium environment needs; without, it does not.

@@ -1,4 +1,4 @@
-"""What bfloat16 and `torch.compile` make of the time of updates, Go1 flat on the CPU.
+"""Time of updates in bfloat16 and with `torch.compile`, Go1 flat on the CPU.
 
 PPO has the settings of the profile `cpu`, and those of the task's own networks; SAC its defaults. Runs take turns
 of two iterations.

@@ -41,7 +41,7 @@ def register_tasks() -> None:
                 name, vector_entry_point="mjlab.gymnasium:make_vec_env", kwargs={"task": task}
             )
         except gymnasium.error.Error as error:
-            logger.warning("Gymnasium cannot have the task %r: %s", task, error)
+            logger.warning("Task %r is not in Gymnasium's registry: %s", task, error)
 
 
 def make_vec_env(

@@ -41,5 +41,8 @@ def test_environments_are_made_checked_and_stepped_by_a_loop():
 
 def test_stable_baselines_takes_the_environment():
     pytest.importorskip("stable_baselines3")
-    code = blocks()["Stable-Baselines3"].replace("512", "4").replace("1_000_000", "1")
-    exec(code.replace('"MlpPolicy", ', '"MlpPolicy", n_steps=4, batch_size=16, env='), {})
+    names: dict = {}
+    code = blocks()["Stable-Baselines3"].replace("= 512", "= 4").replace("4096", "32")
+    exec(code.replace("1_000_000", "1"), names)
+    # One rollout.
+    assert names["model"].num_timesteps == 4 * 32

@@ -31,7 +31,9 @@ def teacher(tmp_path_factory) -> Path:
     return folder / "model_2.pt"
 
 
-def student_runner(folder: Path | None = None, **of_student: Any) -> MjlabOnPolicyRunner:
+def student_runner(
+    folder: Path | None = None, of_teacher: dict[str, Any] | None = None, **of_student: Any
+) -> MjlabOnPolicyRunner:
     student = {"hidden_dims": (16,), "distribution_cfg": gaussian_distribution(0.3), **of_student}
     cfg = RslRlDistillationRunnerCfg(
         num_steps_per_env=6,
@@ -39,7 +41,10 @@ def student_runner(folder: Path | None = None, **of_student: Any) -> MjlabOnPoli
         obs_groups={"student": ("critic",), "teacher": ("actor",)},
         student=RslRlModelCfg(**student),
         teacher=RslRlModelCfg(
-            hidden_dims=(8,), obs_normalization=True, distribution_cfg=gaussian_distribution()
+            hidden_dims=(8,),
+            obs_normalization=True,
+            distribution_cfg=gaussian_distribution(),
+            **(of_teacher or {}),
         ),
         algorithm=RslRlDistillationAlgorithmCfg(gradient_length=3, learning_rate=1e-2),
     )
@@ -85,6 +90,34 @@ def test_a_resumed_run_takes_the_same_course(teacher, tmp_path, of_student):
     second.learn(6)
     expected, found = (runner.alg.student.state_dict() for runner in (whole, second))
     assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
+def test_a_teacher_with_memory_keeps_it_from_one_iteration_to_the_next(tmp_path):
+    memory = {"class_name": "RNNModel", "rnn_type": "gru", "rnn_hidden_dim": 4}
+    networks = {name: {**runner_cfg()[name], **memory} for name in ("actor", "critic")}
+    torch.manual_seed(1)
+    env = RslRlVecEnvWrapper(FakeEnv(FakeEnvCfg()))
+    MjlabOnPolicyRunner(env, runner_cfg(**networks), str(tmp_path)).learn(2)
+    runner = student_runner(of_teacher=memory)
+    runner.load_teacher(str(tmp_path / "model_1.pt"))
+    shown = []
+    act = runner.alg.act
+
+    def acting(observations):
+        shown.append((observations.clone(), runner.alg.teacher.get_hidden_state()))
+        return act(observations)
+
+    runner.alg.act = acting
+    runner.learn(3)
+    assert shown[0][1] is None
+    # Without an end in between, what the teacher remembers is what it has seen since.
+    for (seen, before), (_, after) in zip(shown[1:], shown[2:], strict=False):
+        runner.alg.teacher.reset(hidden_state=before.clone())
+        runner.alg.teacher(seen)
+        expected = runner.alg.teacher.get_hidden_state()
+        kept = (after != 0).any(dim=-1).flatten()
+        assert kept.any()
+        assert torch.equal(after[:, kept], expected[:, kept])
 
 
 def test_without_a_teacher_nothing_is_learned(tmp_path):

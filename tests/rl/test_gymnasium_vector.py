@@ -127,6 +127,11 @@ def test_an_episode_whose_physics_diverges_ends_with_what_was_seen_before(make):
         assert np.array_equal(value, before[name][1])
 
 
+def test_a_step_before_any_reset_is_refused(make):
+    with pytest.raises(RuntimeError, match="expected an environment that was reset"):
+        make(group="actor").step(np.zeros((NUM_ENVS, 1), "f"))
+
+
 def test_time_that_is_part_of_the_task_ends_episodes_for_good(make):
     def finite(cfg: Any) -> None:
         cfg.is_finite_horizon = True
@@ -150,6 +155,8 @@ def test_without_auto_reset_a_mask_says_what_is_reset(make):
     check_vector_env(env, steps=12)
     with pytest.raises(ValueError, match=r"expected \(3,\) bool, got \(3,\) int64"):
         env.reset(options={"reset_mask": np.array([1, 0, 0])})
+    with pytest.raises(ValueError, match="expected a seed or a reset_mask, got both"):
+        env.reset(seed=1, options={"reset_mask": terminated})
 
 
 def test_spaces_have_the_bounds_of_clipped_terms_and_actions(make):
@@ -249,13 +256,14 @@ def test_a_task_is_made_by_its_name_alone():
     assert done.stdout.strip() == f"(4, 5) mjlab/{TASK}"
 
 
-def test_make_vec_passes_on_what_it_is_given(monkeypatch):
+def test_make_vec_passes_on_what_it_is_given():
     seen = []
     env = gymnasium.make_vec(
-        f"mjlab/{TASK}", num_envs=2, play=True, seed=7, edit=seen.append, clip_actions=1.0
+        f"mjlab/{TASK}", num_envs=2, play=True, seed=7, edit=seen.append, clip_actions=1.5
     )
     assert (seen[0].scene.num_envs, seen[0].seed) == (2, 7)
-    assert env.action_space.shape == (2, 1)
+    assert seen[0].episode_length_s == load_env_cfg(TASK, play=True).episode_length_s
+    assert env.action_space.high.tolist() == [[1.5], [1.5]]
     env.close()
 
 

@@ -23,7 +23,8 @@ NUM_ENVS = 3
 
 
 def make_env(auto_reset: bool = True) -> ManagerBasedRlEnv:
-    """Return environments of which 0 fails after 2 steps and 1 runs out of time after 3."""
+    """Return environments of which 0 fails after 2 steps, 1 runs out of time after 3, and 2 does both
+    after 4."""
     cfg = load_env_cfg("Mjlab-Cartpole-Swingup")
     cfg.scene.num_envs, cfg.seed, cfg.sim.engine = NUM_ENVS, 5, "native"
     cfg.auto_reset = auto_reset
@@ -32,8 +33,8 @@ def make_env(auto_reset: bool = True) -> ManagerBasedRlEnv:
         return lambda env: env.episode_length_buf == torch.tensor(steps)
 
     cfg.terminations = {
-        "failed": TerminationTermCfg(func=due(2, 99, 99)),
-        "time_out": TerminationTermCfg(func=due(99, 3, 99), time_out=True),
+        "failed": TerminationTermCfg(func=due(2, 99, 4)),
+        "time_out": TerminationTermCfg(func=due(99, 3, 4), time_out=True),
     }
     return ManagerBasedRlEnv(cfg, device="cpu")
 
@@ -54,6 +55,20 @@ def test_results_are_columns_and_states_those_of_the_critic(env):
         last = env.step(torch.zeros(NUM_ENVS, 1))
     assert [value.shape for value in last[1:4]] == [(NUM_ENVS, 1)] * 3
     assert last[3].flatten().tolist() == [False, True, False]
+    # What fails as its time is over has no future to bootstrap from. (Environment 0 fails again.)
+    _, _, terminated, truncated, _ = env.step(torch.zeros(NUM_ENVS, 1))
+    assert terminated.flatten().tolist() == [True, False, True]
+    assert not truncated.any()
+
+
+def test_agents_that_share_environments_are_refused(env):
+    class Agent:
+        def record_transition(self, **transition: Any) -> None: ...
+
+    observations, *_, infos = (env.reset(), env.step(torch.zeros(NUM_ENVS, 1)))[1]
+    agent = with_final_observations(Agent)()
+    with pytest.raises(ValueError, match="expected one agent for all 3 environments, got 2"):
+        agent.record_transition(next_observations=observations[:2], next_states=None, infos=infos)
 
 
 def test_agents_record_what_episodes_ended_with(env):

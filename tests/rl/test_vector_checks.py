@@ -35,7 +35,6 @@ class Walk(VectorEnv):
         self.action_space = batch_space(self.single_action_space, NUM_ENVS)
         self.places = np.zeros((NUM_ENVS, 2), np.float32)
         self.steps = np.zeros(NUM_ENVS, int)
-        self.resets_now = True
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
@@ -67,17 +66,17 @@ class Walk(VectorEnv):
 
 def test_what_keeps_to_the_interface_passes():
     check_vector_env(Walk())
+    check_vector_env(ByMask())
 
 
+# Observations of the last are numbers, and may stand still.
+@pytest.mark.parametrize("name", ["CartPole-v1", "FrozenLake-v1"])
 @pytest.mark.parametrize("mode", [*AutoresetMode])
-def test_gymnasiums_own_environments_pass(mode):
+def test_gymnasiums_own_environments_pass(mode, name):
     env = gymnasium.make_vec(
-        "CartPole-v1",
-        num_envs=3,
-        vectorization_mode="sync",
-        vector_kwargs={"autoreset_mode": mode},
+        name, num_envs=3, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}
     )
-    check_vector_env(env, steps=60)
+    check_vector_env(gymnasium.wrappers.vector.RecordEpisodeStatistics(env), steps=60)
     env.close()
 
 
@@ -97,6 +96,52 @@ def changed(**of_step: Any) -> type[Walk]:
 
 class NoMode(Walk):
     metadata = {}
+
+
+class ByMask(Walk):
+    """Resets where it is told to."""
+
+    metadata = {"autoreset_mode": AutoresetMode.DISABLED}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        if options is None:
+            return super().reset(seed=seed)
+        self._restart(self.rows(options["reset_mask"]))
+        return self.places.copy(), {}
+
+    def rows(self, mask: np.ndarray) -> np.ndarray:
+        return mask
+
+    def restarted(self, ended: np.ndarray) -> dict[str, Any]:
+        return {}
+
+
+class ResetsAll(ByMask):
+    def rows(self, mask: np.ndarray) -> np.ndarray:
+        return np.ones_like(mask)
+
+
+class ResetsNone(ByMask):
+    def rows(self, mask: np.ndarray) -> np.ndarray:
+        self.steps[mask] = 0
+        return np.zeros_like(mask)
+
+
+class OwnRewards(Walk):
+    rewards = np.zeros(NUM_ENVS)
+
+    def step(self, actions: Any) -> Any:
+        observations, rewards, *rest = super().step(actions)
+        self.rewards[:] = rewards
+        return observations, self.rewards, *rest
+
+
+class SaysNextStepSilently(Walk):
+    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}
+
+    def step(self, actions: Any) -> Any:
+        observations, _, *rest = super().step(actions)
+        return observations, np.zeros(NUM_ENVS), *rest
 
 
 class SaysNextStep(Walk):
@@ -170,11 +215,18 @@ def late(infos: dict[str, Any]) -> dict[str, Any]:
 
 FAULTS: dict[str, tuple[type[Walk], str]] = {
     "no mode": (NoMode, r"autoreset_mode: expected metadata\['autoreset_mode'\]"),
-    "another mode": (SaysNextStep, "autoreset: expected reward 0 in the step after an end"),
-    "no reset": (ResetsTimeOutsOnly, "reset: final_obs is what step returns"),
+    "another mode": (SaysNextStep, "expected none with AutoresetMode.NEXT_STEP|expected reward 0"),
+    "another mode, no rewards": (
+        SaysNextStepSilently,
+        "final_obs: expected none with AutoresetMode",
+    ),
+    "reset of all": (ResetsAll, "reset_mask: expected a reset where it is true, got one where"),
+    "reset of none": (ResetsNone, "reset: observations after an end are those before the reset"),
+    "one buffer of rewards": (OwnRewards, "aliasing: what was returned is changed by the next"),
+    "no reset": (ResetsTimeOutsOnly, "reset: observations after an end are those before the reset"),
     "stale final observation": (StaleFinal, "stale final_obs: it is the observation before"),
     "no final observation": (NoFinal, r"final_obs: expected infos\['_final_obs'\] to be true"),
-    "one buffer": (OwnMemory, "aliasing: observations that were returned are changed"),
+    "one buffer": (OwnMemory, "aliasing: what was returned is changed by the next step"),
     "seed": (IgnoresSeed, "seed: two runs with seed 0 differ from step 0 on"),
     "bounds": (Narrow, "observations: observations: values are outside of the bounds"),
     "batched space": (Unbatched, r"observation_space: expected batch_space\(single_obs"),

@@ -47,6 +47,38 @@ def test_a_teacher_that_ppo_did_not_train_is_refused(run, student, tmp_path):
     assert "expected a checkpoint of the learner 'ppo'" in outcome.message
 
 
+def test_flags_that_would_teach_nothing_are_refused(run, student, tmp_path):
+    teacher = str(checkpoints_in(student[0])[-1])
+    argv = [TASK, *SMALL, "--log-root", str(tmp_path), *STUDENT]
+    outcome = run("train", *argv, "--agent.algorithm.gradient-length", "9")
+    assert "gradient-length: expected at most 8" in outcome.message
+    other = ["Mjlab-Cartpole-Balance", *argv[1:], "--agent.teacher-checkpoint", teacher]
+    assert f"expected a checkpoint of Mjlab-Cartpole-Balance, got {teacher}" in (
+        run("train", *other).message
+    )
+    logs = ["--log-root", str(student[1].parents[1]), "--agent.resume", "True"]
+    argv = [TASK, *SMALL, *logs, *STUDENT, "--agent.load-run", student[1].name]
+    outcome = run("train", *argv, "--agent.teacher-checkpoint", "another.pt")
+    assert f"expected that of the resumed run, {teacher}, got another.pt" in outcome.message
+
+
+@pytest.mark.slow
+def test_a_blind_student_follows_a_teacher_with_a_scan(run, tmp_path):
+    task = "Mjlab-Velocity-Rough-Unitree-Go1"
+    argv = [task, *SMALL, "--log-root", str(tmp_path), "--agent.max-iterations", "2"]
+    for flags in (
+        ["--profile", "cpu"],
+        ["--profile", "blind", "--agent.teacher-checkpoint", f"{tmp_path}/go1_velocity/model_1.pt"],
+    ):
+        outcome = run("train", *argv, *flags)
+        assert outcome.status == 0, outcome.err
+    checkpoint = checkpoints_in(max((tmp_path / "go1_velocity").iterdir()))[-1]
+    for path in (checkpoint, next(checkpoint.parent.glob("*.onnx"))):
+        flags = ["--checkpoint-file", str(path), "--num-episodes", "2", "--device", "cpu"]
+        outcome = run("evaluate", task, *flags, "--env.episode-length-s", "1", "--seed", "1")
+        assert outcome.status == 0, outcome.err
+
+
 def test_a_student_without_a_teacher_is_told_so(run, tmp_path):
     outcome = run("train", TASK, *SMALL, "--log-root", str(tmp_path), *STUDENT)
     assert outcome.status == 1
@@ -62,3 +94,6 @@ def test_the_blind_student_of_rough_ground_sees_all_but_the_ground():
     assert cfg.obs_groups == {"student": ("student",), "teacher": ("actor",)}
     teacher = load_rl_cfg(task, profile="cpu").actor
     assert cfg.teacher == teacher
+    # The teacher's own learner under the student's profile, for playing the teacher in it.
+    ppo = load_rl_cfg(task, profile="blind", learner="ppo")
+    assert ppo.obs_groups == load_rl_cfg(task).obs_groups

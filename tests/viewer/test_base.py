@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 import os
 import signal
+from types import SimpleNamespace
 
 import pytest
 import torch
 from viewer_fakes import FakeEnv, push
 
 from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction
+from mjlab.viewer.protocols import forget
 
 
 class ListViewer(BaseViewer):
@@ -150,6 +152,15 @@ def test_a_policy_with_memory_forgets_what_ended(viewer) -> None:
     viewer.env.step = lambda actions: (None, None, dones, {})
     viewer.step_simulation()
     assert seen == [dones]
+    # An environment without a wrapper.
+    viewer.env.step = lambda actions: (None, None, dones == 0, dones == 1, {})
+    viewer.step_simulation()
+    assert seen[1].tolist() == [True]
+
+
+@pytest.mark.parametrize("reset", [lambda: 1 / 0, lambda env_ids=None: 1 / 0, iter, None])
+def test_policies_that_know_nothing_of_ends_are_left_alone(reset) -> None:
+    forget(SimpleNamespace(reset=reset), torch.tensor([1]))
 
 
 def test_a_reset_that_fails_is_shown_and_ends_nothing(viewer) -> None:

@@ -102,11 +102,13 @@ class GymnasiumVectorEnv(VectorEnv):
         torch) is seeded. What was randomized when the environment was built stays.
 
         Raises:
-            ValueError: the mask has another shape or type, or a negative seed.
+            ValueError: the mask has another shape or type, or comes with a seed.
         """
         super().reset(seed=seed)
         mask = torch.ones(self.num_envs, dtype=torch.bool)
         if options is not None and "reset_mask" in options:
+            if seed is not None:
+                raise ValueError("reset: expected a seed or a reset_mask, got both.")
             mask = torch.as_tensor(options["reset_mask"])
             # Numbers would be taken for ids.
             if mask.shape != (self.num_envs,) or mask.dtype != torch.bool:
@@ -134,6 +136,10 @@ class GymnasiumVectorEnv(VectorEnv):
         if self._limit is not None:
             actions = actions.clamp(-self._limit, self._limit)
         before = self._observations
+        if not before:
+            raise RuntimeError(
+                "step: expected an environment that was reset, got a new one; call reset."
+            )
         lengths = self.env.unwrapped.episode_length_buf.clone()
         self._observations, rewards, terminated, truncated, extras = self.env.step(actions)
         self._returns += rewards
@@ -178,12 +184,19 @@ class GymnasiumVectorEnv(VectorEnv):
     ) -> None:
         """Add to `infos` what the episodes of environments `ended` (N,) ended with."""
         final = np.full(self.num_envs, None, dtype=object)
-        # What has no final observation diverged.
-        for row in ended.nonzero().flatten().tolist():
-            final[row] = self._shown(_rows(before, row))
-        ids = extras.get("final_ids", ())
-        for position, row in enumerate(ids.tolist() if len(ids) else ()):
-            final[row] = self._shown(_rows(extras["final_observations"], position))
+        rows = ended.nonzero().flatten()
+        ids = rows[:0]
+        if "final_ids" in extras:
+            ids = extras["final_ids"]
+            shown = self._shown(extras["final_observations"])
+            for position, row in enumerate(ids.tolist()):
+                final[row] = _row(shown, position)
+        # Those without a final observation diverged.
+        diverged = rows[~torch.isin(rows, ids)]
+        if len(diverged) > 0:
+            shown = self._shown(_row(before, diverged))
+            for position, row in enumerate(diverged.tolist()):
+                final[row] = _row(shown, position)
         mask = self._array(ended)
         infos |= {
             "final_obs": final,
@@ -273,12 +286,16 @@ def _term_bounds(
     if scale.ndim > 0 and shape[-1] != scale.shape[-1]:
         # A flat history repeats the components.
         scale = np.tile(scale, shape[-1] // scale.shape[-1])
-    ends = [np.broadcast_to(np.float32(end) * scale, shape) for end in cfg.clip]
+    # An infinite bound times a scale of 0 is 0.
+    ends = [
+        np.broadcast_to(np.where(scale == 0.0, 0.0, np.float32(end) * scale), shape)
+        for end in cfg.clip
+    ]
     return np.minimum(*ends), np.maximum(*ends)
 
 
-def _rows(values: dict[str, Any], row: int) -> dict[str, Any]:
-    return {
-        name: _rows(value, row) if isinstance(value, dict) else value[row]
-        for name, value in values.items()
-    }
+def _row(values: Any, row: Any) -> Any:
+    """Return a row of arrays, or several."""
+    if isinstance(values, dict):
+        return {name: _row(value, row) for name, value in values.items()}
+    return values[row]

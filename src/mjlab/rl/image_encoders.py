@@ -18,7 +18,7 @@ def settle_image_settings(observations: TensorDict, cfg: dict[str, Any]) -> None
     A network that sees images only has nothing to normalize, since images never are. A critic that
     shares the actor's encoders needs no settings for its own.
     """
-    for model in ("actor", "critic"):
+    for model in ("actor", "critic", "student", "teacher"):
         groups = (cfg.get("obs_groups") or {}).get(model, ())
         known = [observations[name] for name in groups if name in observations]
         if cfg.get(model) and known and all(value.ndim == 4 for value in known):

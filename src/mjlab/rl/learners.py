@@ -71,7 +71,8 @@ def with_learner(cfg: RslRlBaseRunnerCfg, learner: Learner) -> RslRlBaseRunnerCf
 def _distillation(cfg: RslRlBaseRunnerCfg, base: dict[str, Any]) -> RslRlDistillationRunnerCfg:
     if learner_of(cfg) != "ppo":
         raise ValueError(
-            f"distillation: expected a teacher of the learner 'ppo', got one of {learner_of(cfg)!r}."
+            f"distillation: expected a teacher of the learner 'ppo', got one of {learner_of(cfg)!r}; use "
+            "another profile, or none."
         )
     teacher: RslRlModelCfg = copy.deepcopy(getattr(cfg, "actor", RslRlModelCfg()))
     groups = cfg.obs_groups.get("actor", ("actor",))
@@ -87,11 +88,14 @@ def _distillation(cfg: RslRlBaseRunnerCfg, base: dict[str, Any]) -> RslRlDistill
 def for_task_of(cfg: RslRlBaseRunnerCfg, other: RslRlBaseRunnerCfg) -> RslRlBaseRunnerCfg:
     """Return a copy of `cfg` with what `other` says of the task, such as its evaluation.
 
-    The number of iterations, their length and the interval of checkpoints are those of `cfg`.
+    The number of iterations, their length and the interval of checkpoints are those of `cfg`, and so
+    are the observation groups if the networks have other names.
     """
     cfg = copy.deepcopy(cfg)
+    names = {learner_of(one) == "distillation" for one in (cfg, other)}
+    kept = _PACE if len(names) == 1 else _PACE | {"obs_groups"}
     for field in fields(RslRlBaseRunnerCfg):
-        if field.name not in _PACE:
+        if field.name not in kept:
             setattr(cfg, field.name, copy.deepcopy(getattr(other, field.name)))
     return cfg
 

@@ -122,8 +122,8 @@ def check_fits(
     ]
     raise CheckpointError(
         f"The checkpoint {path!r} is of another network: its {name} does not fit this task's "
-        f"{name} config.\n" + "\n".join(lines) + "\nUse a checkpoint of this task, or set "
-        f"--agent.{name}.hidden-dims and the observations as they were when it was trained."
+        f"{name} config.\n" + "\n".join(lines) + "\nUse a checkpoint of this task, or make "
+        f"the network (--agent.{name}.) and the observations what they were when it was trained."
     )
 
 

@@ -215,7 +215,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                         observations = self._collect(observations)
                     collected = time.perf_counter()
                     self.alg.compute_returns(observations)
-                losses = self.alg.update()
+                losses = self._update()
             learned = time.perf_counter()
             self._observations = observations
             self.current_learning_iteration = iteration + 1
@@ -281,6 +281,22 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         values = critic(everywhere).detach().squeeze(-1)[ids]
         critic.reset(hidden_state=hidden_state)
         return values
+
+    def _update(self) -> dict[str, float]:
+        """Learn from what was collected; return the losses.
+
+        rsl_rl's distillation lets a teacher with memory forget what it has seen. It goes on here.
+        """
+        algorithm: Any = self.alg
+        teacher = getattr(algorithm, "teacher", None)
+        if teacher is None or not teacher.is_recurrent:
+            return algorithm.update()
+        remembered = teacher.get_hidden_state()
+        losses = algorithm.update()
+        teacher.reset(hidden_state=remembered)
+        # An update writes to this one, which the teacher's cannot take, made in inference mode.
+        algorithm.last_hidden_states = (algorithm.last_hidden_states[0], None)
+        return losses
 
     def _report(
         self,

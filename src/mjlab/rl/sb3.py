@@ -46,7 +46,9 @@ class Sb3VecEnv(VecEnv):
             ValueError: no such group, `clip_actions` is not positive, or no `auto_reset`.
         """
         if not env.unwrapped.cfg.auto_reset:
-            raise ValueError("auto_reset: expected True, got False, which Stable-Baselines3 lacks.")
+            raise ValueError(
+                "auto_reset: expected True, got False; Stable-Baselines3 resets no environments."
+            )
         # First, because the constructor asks for attributes.
         self.env = env
         self._envs = gymnasium_env(env, group, clip_actions)

@@ -48,7 +48,9 @@ class SkrlEnv(Wrapper):
         super().__init__(env)
         core = env.unwrapped
         if not core.cfg.auto_reset:
-            raise ValueError("auto_reset: expected True, got False, which skrl's trainers lack.")
+            raise ValueError(
+                "auto_reset: expected True, got False; skrl's trainers reset no environments."
+            )
         self._group, self._state_group, self._limit = group, state_group, clip_actions
         self._observation_space = observation_space(core, group)
         self._state_space = observation_space(core, state_group) if state_group else None
@@ -92,8 +94,10 @@ class SkrlEnv(Wrapper):
             actions = actions.clamp(-self._limit, self._limit)
         self._observations, rewards, terminated, truncated, extras = self._env.step(actions)
         if self._unwrapped.cfg.is_finite_horizon:
-            terminated, truncated = terminated | truncated, torch.zeros_like(truncated)
-        infos: dict[str, Any] = {"log": dict(extras["log"])}
+            terminated = terminated | truncated
+        # skrl bootstraps wherever an episode is truncated, also where it failed in the same step.
+        truncated = truncated & ~terminated
+        infos: dict[str, Any] = {"log": dict(extras["log"]), "num_envs": len(rewards)}
         if "final_ids" in extras:
             final = extras["final_observations"]
             infos["final_ids"] = extras["final_ids"]
@@ -124,13 +128,19 @@ def with_final_observations(agent: type[Agent]) -> type[Agent]:
     """Return a subclass of a class of agents that records the observations episodes ended with.
 
     skrl's trainers pass on what `step` returns, which is the first observation of the next episode where
-    one ended. With `time_limit_bootstrap`, an agent would take its value for that of the end.
+    one ended. With `time_limit_bootstrap`, an agent would take its value for that of the end. The agent
+    has all environments; several agents that share them by scopes raise ValueError.
     """
 
     class WithFinalObservations(agent):
         def record_transition(
             self, *, next_observations: Any, next_states: Any, infos: Any, **rest: Any
         ) -> None:
+            if len(next_observations) != infos["num_envs"]:
+                raise ValueError(
+                    f"with_final_observations: expected one agent for all {infos['num_envs']} "
+                    f"environments, got {len(next_observations)} of them; use no scopes."
+                )
             if "final_ids" in infos:
                 ids = infos["final_ids"]
                 next_observations = _replaced(next_observations, ids, infos["final_observations"])

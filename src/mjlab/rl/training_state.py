@@ -65,8 +65,7 @@ def restore(
             model.reset(hidden_state=_as_tuples(_to(hidden, device)))
     if hasattr(algorithm, "last_hidden_states"):
         # Of rsl_rl's distillation, which begins an update with those before the iteration.
-        models = (algorithm.student, algorithm.teacher)
-        algorithm.last_hidden_states = tuple(model.get_hidden_state() for model in models)
+        algorithm.last_hidden_states = (algorithm.student.get_hidden_state(), None)
     _restore_rnd(getattr(algorithm, "rnd", None), state["rnd"], device)
     observations = _unflat(state["observations"], env.num_envs).to(device)
     # Last, because restoring may have drawn random numbers.

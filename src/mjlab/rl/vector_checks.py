@@ -56,7 +56,7 @@ def check_vector_env(
                 break
     if check.faults:
         found = "\n".join(f"- {kind}: {text}" for kind, text in check.faults.items())
-        raise VectorEnvError(f"{env} is no proper vector environment:\n{found}")
+        raise VectorEnvError(f"{env} breaks Gymnasium's vector interface:\n{found}")
 
 
 class _Check:
@@ -68,6 +68,11 @@ class _Check:
         self.ends: list[np.ndarray] = []
         self._limit = action_limit
         self._mode: AutoresetMode | None = None
+        # Of the last step: its first four results, copies of them, and where episodes ended.
+        self._given: Any = None
+        self._copies: Any = None
+        self._ended = np.zeros(0, dtype=bool)
+        self._stale, self._unreset, self._still = _Always(), _Always(), False
 
     def fault(self, kind: str, text: str) -> None:
         self.faults.setdefault(kind, text)
@@ -75,54 +80,85 @@ class _Check:
     def run(self, steps: int, seed: int) -> list[Any]:
         """Reset and step; return copies of all that was returned, as far as nothing was wrong."""
         self._check_attributes()
-        self.ends = []
         if self.faults:
             return []
-        env, returned = self.env, []
-        actions = _bounded(env.action_space, self._limit)
+        actions = _bounded(self.env.action_space, self._limit)
         actions.seed(seed)
-        result = env.reset(seed=seed)
-        if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
-            self.fault("reset", f"expected (observations, infos), got {_kind(result)}")
-            return []
-        observations, infos = result
-        self._check_observations("reset", observations)
-        self._check_masks(infos)
-        ended = np.zeros(env.num_envs, dtype=bool)
-        kept = observations, _copied(observations)
-        returned.append(kept[1])
-        stale, unreset = _Always(), _Always()
+        self.ends = []
+        returned = [self._reset(seed=seed)]
         for _ in range(steps):
-            if self._mode is AutoresetMode.DISABLED and ended.any():
-                observations, _ = env.reset(options={"reset_mask": ended})
-                kept = observations, _copied(observations)
-            result = env.step(actions.sample())
-            if not (isinstance(result, tuple) and len(result) == 5 and isinstance(result[4], dict)):
-                self.fault("step", f"expected five results, the last a dict, got {_kind(result)}")
-                return []
-            if not _same(*kept):
-                self.fault(
-                    "aliasing",
-                    "observations that were returned are changed by the next step; return copies",
-                )
-            self._check_step(result, ended)
             if self.faults:
                 return []
-            before, ended_before = kept[1], ended
-            observations, rewards, terminated, truncated, infos = result
-            ended = _array(terminated) | _array(truncated)
-            self.ends.append(ended)
-            kept = observations, _copied(observations)
-            returned.append(_copied(result[:4]))
-            if self._mode is AutoresetMode.SAME_STEP:
-                self._check_final(infos, ended, _array(terminated), before, kept[1], stale, unreset)
-            if self._mode is AutoresetMode.NEXT_STEP:
-                self._check_next_step(rewards, ended, ended_before)
-        if stale:
+            if self._mode is AutoresetMode.DISABLED and self._ended.any():
+                self._reset_ended()
+            returned.append(self._step(actions.sample()))
+        # Where observations stand still anyway, one that does shows nothing.
+        if self._stale and not self._still:
             self.fault("stale final_obs", "it is the observation before the last step")
-        if unreset:
-            self.fault("reset", "final_obs is what step returns: environments go on unreset")
+        if self._unreset and not self._still:
+            self.fault("reset", "observations after an end are those before the reset")
         return returned
+
+    def _reset(self, **kwargs: Any) -> Any:
+        """Reset, check what is returned, and return a copy of the observations."""
+        result = self.env.reset(**kwargs)
+        if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
+            self.fault("reset", f"expected (observations, infos), got {_kind(result)}")
+            return None
+        self._check_observations("reset", result[0])
+        self._check_masks(result[1])
+        self._given = result[:1]
+        self._copies = _copied(self._given)
+        self._ended = np.zeros(self.env.num_envs, dtype=bool)
+        return self._copies[0]
+
+    def _reset_ended(self) -> None:
+        """Reset where episodes ended, which are to change, and nowhere else."""
+        ended, before = self._ended, self._rows(self._copies[0])
+        self._reset(options={"reset_mask": ended.copy()})
+        if self.faults:
+            return
+        after = self._rows(self._copies[0])
+        for row in range(self.env.num_envs):
+            same = _same(before[row], after[row])
+            if ended[row]:
+                self._unreset.see(True, same)
+            elif not same:
+                self.fault(
+                    "reset_mask", "expected a reset where it is true, got one where it is false"
+                )
+
+    def _step(self, action: Any) -> Any:
+        """Step, check what is returned, and return copies of its first four results."""
+        result = self.env.step(action)
+        if not (isinstance(result, tuple) and len(result) == 5 and isinstance(result[4], dict)):
+            self.fault("step", f"expected five results, the last a dict, got {_kind(result)}")
+            return None
+        if not _same(self._given, self._copies):
+            self.fault("aliasing", "what was returned is changed by the next step; return copies")
+        self._check_step(result)
+        if self.faults:
+            return None
+        before, ended_before = self._rows(self._copies[0]), self._ended
+        self._given, infos = result[:4], result[4]
+        self._copies = _copied(self._given)
+        after, rewards, terminated, truncated = self._copies
+        self._ended = ended = terminated | truncated
+        self.ends.append(ended)
+        after = self._rows(after)
+        untouched = np.flatnonzero(~(ended | ended_before))
+        self._still |= any(_same(before[row], after[row]) for row in untouched)
+        if self._mode is AutoresetMode.SAME_STEP:
+            self._check_final(infos, ended, terminated, before, after)
+        elif "final_obs" in infos:
+            self.fault("final_obs", f"expected none with {self._mode}, got infos['final_obs']")
+        if self._mode is AutoresetMode.NEXT_STEP:
+            self._check_next_step(rewards, ended, ended_before)
+        return self._copies
+
+    def _rows(self, observations: Any) -> list[Any]:
+        """Return the observation of each environment."""
+        return list(iterate(self.env.observation_space, observations))
 
     def _check_attributes(self) -> None:
         env = self.env
@@ -150,7 +186,7 @@ class _Check:
         for text in _mismatches(self.env.observation_space, observations, "observations"):
             self.fault("observations", f"{text}, in {where}")
 
-    def _check_step(self, result: tuple[Any, ...], ended_before: np.ndarray) -> None:
+    def _check_step(self, result: tuple[Any, ...]) -> None:
         observations, rewards, terminated, truncated, infos = result
         self._check_observations("step", observations)
         shape = (self.env.num_envs,)
@@ -173,13 +209,16 @@ class _Check:
         self._check_masks(infos)
 
     def _check_masks(self, infos: dict[str, Any], path: str = "infos") -> None:
-        """Check that each entry has its mask, and one value for each environment."""
+        """Check that each entry has its mask, and one value for each environment.
+
+        Entries of an entry may go by its mask: those of Gymnasium's own wrappers do.
+        """
         for name, value in infos.items():
             if name.startswith("_"):
                 continue
             mask = infos.get(f"_{name}")
             label = f"{path}[{name!r}]"
-            if not (
+            if (mask is not None or path == "infos") and not (
                 isinstance(mask, np.ndarray | torch.Tensor)
                 and tuple(mask.shape) == (self.env.num_envs,)
                 and _array(mask).dtype == np.bool_
@@ -197,10 +236,8 @@ class _Check:
         infos: dict[str, Any],
         ended: np.ndarray,
         terminated: np.ndarray,
-        before: Any,
-        after: Any,
-        stale: _Always,
-        unreset: _Always,
+        before: list[Any],
+        after: list[Any],
     ) -> None:
         """Check what a step that resets says of the episodes that ended in it."""
         for name in _FINAL:
@@ -222,25 +259,23 @@ class _Check:
         if any(final[row] is not None for row in np.flatnonzero(~ended)):
             self.fault("final_obs", "expected None where no episode ended")
         single = self.env.single_observation_space
-        every_before = list(iterate(self.env.observation_space, before))
-        every_after = list(iterate(self.env.observation_space, after))
         for row in np.flatnonzero(ended):
             for text in _mismatches(single, final[row], "final_obs"):
                 self.fault("final_obs", text)
                 return
-            stale.see(terminated[row], _same(final[row], every_before[row]))
-            unreset.see(terminated[row], _same(final[row], every_after[row]))
+            self._stale.see(terminated[row], _same(final[row], before[row]))
+            self._unreset.see(terminated[row], _same(final[row], after[row]))
 
-    def _check_next_step(self, rewards: Any, ended: np.ndarray, before: np.ndarray) -> None:
+    def _check_next_step(self, rewards: np.ndarray, ended: np.ndarray, before: np.ndarray) -> None:
         """Check that a step after the end of an episode only resets."""
-        if before.any() and (_array(rewards)[before] != 0).any():
+        if (rewards[before] != 0).any():
             self.fault("autoreset", "expected reward 0 in the step after an end, which only resets")
         if (ended & before).any():
             self.fault("autoreset", "an episode ends in the step that only resets")
 
 
 class _Always:
-    """Whether something was true at every end of episodes of one kind: terminations or time-outs."""
+    """Observation that is true of all ends of one kind, terminations or time-outs, or is not."""
 
     def __init__(self) -> None:
         self._seen: dict[bool, list[bool]] = {}
@@ -276,7 +311,7 @@ def _mismatches(space: gymnasium.Space, value: Any, label: str) -> Iterator[str]
         return
     if isinstance(value, torch.Tensor):
         value = _array(value)
-    if not isinstance(value, np.ndarray) and space.shape is not None:
+    if not isinstance(value, np.ndarray) and space.shape:
         yield f"{label}: expected an array {space.shape}, got {_kind(value)}"
     elif isinstance(value, np.ndarray) and (value.shape, value.dtype) != (space.shape, space.dtype):
         yield (

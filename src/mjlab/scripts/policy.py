@@ -13,7 +13,12 @@ from mjlab.rl.config import RslRlBaseRunnerCfg, RslRlDistillationRunnerCfg
 from mjlab.rl.learners import Learner, acting_cfg
 from mjlab.scripts.cli import UserError, tell
 from mjlab.scripts.profiles import parse_with_choices, profile_of_run
-from mjlab.scripts.run_folder import named_checkpoint, newest_checkpoint, read_agent_params
+from mjlab.scripts.run_folder import (
+    named_checkpoint,
+    newest_checkpoint,
+    read_agent_params,
+    read_run_info,
+)
 from mjlab.scripts.task_options import prepare_env_cfg, with_task_options
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 
@@ -198,30 +203,48 @@ def _saved_settings(
     }
 
 
-def prepare_teacher(cfg: RslRlBaseRunnerCfg, resumed: Path | None) -> None:
-    """Give a distillation's teacher the network that it had in its run, or in the `resumed` one.
+def prepare_teacher(task: str, cfg: RslRlBaseRunnerCfg, resumed: Path | None) -> None:
+    """Settle checkpoint and network of a distillation's teacher, in place; else do nothing.
+
+    The network is that of the teacher's run. A `resumed` run has its teacher already.
 
     Raises:
-        UserError: the teacher was not trained by PPO.
-        CheckpointError: its checkpoint is missing or damaged.
+        UserError: there is no such checkpoint, or it is not one of PPO and of this task; or the
+            resumed run has another teacher.
+        CheckpointError: the checkpoint is damaged.
     """
     if not isinstance(cfg, RslRlDistillationRunnerCfg):
         return
-    path, network = cfg.teacher_checkpoint, "actor"
+    flag, given = "--agent.teacher-checkpoint", cfg.teacher_checkpoint
     if resumed is not None:
-        path, network = str(resumed), "teacher"
-    elif path is not None:
-        from mjlab.rl.checkpoint import learner_of_checkpoint
-
-        learner = learner_of_checkpoint(path)
-        if learner != "ppo":
+        saved, network = read_agent_params(resumed.parent), "teacher"
+        recorded = saved.get("teacher_checkpoint")
+        if given is not None and given != recorded:
             raise UserError(
-                f"--agent.teacher-checkpoint: expected a checkpoint of the learner 'ppo', got {path}, "
-                f"which {learner!r} wrote."
+                f"{flag}: expected that of the resumed run, {recorded}, got {given}; leave it out."
             )
-    if path is not None:
-        saved = read_agent_params(Path(path).parent)
-        cfg.teacher = replace(cfg.teacher, **_saved_settings(saved, network, asdict(cfg.teacher)))
+        cfg.teacher_checkpoint = recorded if isinstance(recorded, str) else None
+    elif given is not None:
+        path = named_checkpoint(Path(given), task)
+        _check_teacher(task, path, flag)
+        cfg.teacher_checkpoint = str(path)
+        saved, network = read_agent_params(path.parent), "actor"
+    else:
+        return
+    cfg.teacher = replace(cfg.teacher, **_saved_settings(saved, network, asdict(cfg.teacher)))
+
+
+def _check_teacher(task: str, path: Path, flag: str) -> None:
+    from mjlab.rl.checkpoint import learner_of_checkpoint
+
+    learner = learner_of_checkpoint(path)
+    if learner != "ppo":
+        raise UserError(
+            f"{flag}: expected a checkpoint of the learner 'ppo', got {path}, which {learner!r} wrote."
+        )
+    trained = read_run_info(path.parent).get("task", task)
+    if trained != task:
+        raise UserError(f"{flag}: expected a checkpoint of {task}, got {path}, of {trained}.")
 
 
 def find_checkpoint(task: str, flags: PolicyFlags) -> Path | None:

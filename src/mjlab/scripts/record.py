@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from mjlab.scripts.policy import make_env, make_policy
-from mjlab.viewer.protocols import forget_ended
+from mjlab.viewer.protocols import ended, forget
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -77,7 +77,7 @@ def record_policy(
         )
         with torch.inference_mode():
             for _ in range(video.length):
-                forget_ended(policy, env.step(policy(env.get_observations()))[2])
+                forget(policy, ended(env.step(policy(env.get_observations()))))
                 writer.add(env.unwrapped.render(video.camera))
         path = writer.close()
     finally:

@@ -38,6 +38,13 @@ def _check_numbers(cfg: TrainConfig) -> None:
     for name in _ALGORITHM_COUNTS:
         # Each algorithm has some of them.
         counts[f"--agent.algorithm.{name}"] = getattr(getattr(agent, "algorithm", None), name, 1)
+    gradient_length = getattr(agent.algorithm, "gradient_length", None)
+    steps = agent.num_steps_per_env * getattr(agent.algorithm, "num_learning_epochs", 1)
+    if gradient_length is not None and gradient_length > steps:
+        raise UserError(
+            f"--agent.algorithm.gradient-length: expected at most {steps}, the steps of an iteration "
+            f"times its epochs, got {gradient_length}; with it nothing is learned."
+        )
     counts |= {"--video-length": cfg.video_length, "--video-interval": cfg.video_interval}
     for flag, value in counts.items():
         if value < 1:

@@ -174,7 +174,7 @@ def _train(
             print(f"Task:    {task}, {env.num_envs} environments{each}{under}")
             print(f"Physics: {env.unwrapped.sim.capabilities.description}", flush=True)
             with same_fate():
-                prepare_teacher(cfg.agent, checkpoint)
+                prepare_teacher(task, cfg.agent, checkpoint)
                 runner = _build_runner(task, cfg, env, folder.path, device)
                 if checkpoint is not None:
                     runner.load(str(checkpoint))

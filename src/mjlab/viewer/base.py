@@ -21,7 +21,7 @@ from mjlab.viewer.protocols import PolicyProtocol as PolicyProtocol
 from mjlab.viewer.protocols import VerbosityLevel as VerbosityLevel
 from mjlab.viewer.protocols import ViewerAction as ViewerAction
 from mjlab.viewer.protocols import ViewerStatus as ViewerStatus
-from mjlab.viewer.protocols import forget_ended
+from mjlab.viewer.protocols import ended, forget
 
 log = logging.getLogger(__name__)
 
@@ -154,7 +154,7 @@ class BaseViewer(ABC):
         with self._pause_on_error("stepping the environment"), torch.no_grad():
             self.sync_viewer_to_env()
             actions = self.policy(self.env.get_observations())
-            forget_ended(self.policy, self.env.step(actions)[2])
+            forget(self.policy, ended(self.env.step(actions)))
             self._step_count += 1
             self._total_steps += 1
             self._rates.count(steps=1)
@@ -267,9 +267,9 @@ class BaseViewer(ABC):
         """Reset all environments, and the policy where it has a memory."""
         with torch.no_grad():
             self.env.reset()
-        forget = getattr(self.policy, "reset", None)
-        if callable(forget):
-            forget()
+        reset_policy = getattr(self.policy, "reset", None)
+        if callable(reset_policy):
+            reset_policy()
         self._step_count = 0
         self._pacer.clear()
         self._last_error = None

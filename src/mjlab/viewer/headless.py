@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from mjlab.viewer.protocols import ended, forget
+
 if TYPE_CHECKING:
     from mjlab.viewer.base import EnvProtocol, PolicyProtocol
 
@@ -50,8 +52,8 @@ def run_headless(
         for step in range(num_steps):
             result = env.step(policy(env.get_observations()))
             reward_sum += result[1].double().mean()
-            # Four results are (obs, reward, done, extras), five split done in two.
-            done = result[2] if len(result) == 4 else result[2] | result[3]
+            done = ended(result)
+            forget(policy, done)
             episodes += (done != 0).sum()
             if on_step is not None:
                 on_step(step + 1)

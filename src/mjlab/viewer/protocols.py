@@ -55,10 +55,20 @@ class PolicyProtocol(Protocol):
     def __call__(self, obs: torch.Tensor) -> torch.Tensor: ...
 
 
-def forget_ended(policy: Any, dones: torch.Tensor) -> None:
-    """Let a policy with memory forget the environments whose episodes ended, `dones` (num_envs,)."""
+def ended(results: tuple[Any, ...]) -> torch.Tensor:
+    """Return where an episode ended (num_envs,), from the four or five results of a step."""
+    return results[2] if len(results) == 4 else results[2] | results[3]
+
+
+def forget(policy: Any, dones: torch.Tensor) -> None:
+    """Let a policy with memory forget the environments in which `dones` (num_envs,) is not 0."""
     reset = getattr(policy, "reset", None)
-    if callable(reset) and inspect.signature(reset).parameters:
+    try:
+        knows_ends = callable(reset) and "dones" in inspect.signature(reset).parameters
+    except (TypeError, ValueError):
+        # Compiled functions do not say what they take.
+        return
+    if knows_ends:
         reset(dones)
 
 

@@ -12,6 +12,7 @@ import viser
 
 from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction
 from mjlab.viewer.camera import resolve_camera
+from mjlab.viewer.protocols import forget
 from mjlab.viewer.viser.checkpoints import CheckpointManager as CheckpointManager
 from mjlab.viewer.viser.checkpoints import CheckpointPanel
 from mjlab.viewer.viser.checkpoints import format_time_ago as format_time_ago
@@ -306,4 +307,5 @@ class ViserPlayViewer(BaseViewer):
                 # What the reset observed is of the state before.
                 env.observation_manager.reset(ids)
                 env.obs_buf = env.observation_manager.compute(update_history=True, env_ids=ids)
+            forget(self.policy, torch.zeros(env.num_envs, device=env.device).index_fill_(0, ids, 1))
         self.after_reset()

@@ -1,7 +1,7 @@
 """The `blind` profile of velocity tasks on rough terrain: a student that does not see the ground.
 
 A teacher with the height scan learns first, under the profile `cpu`. The student then learns to act as
-the teacher does, from what a robot without a scanner has: the other observations of the last steps.
+the teacher does, from the other observations of the last steps.
 """
 
 from __future__ import annotations
