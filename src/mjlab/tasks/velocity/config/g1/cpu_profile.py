@@ -255,7 +255,7 @@ def _learner(rl_cfg: RslRlOnPolicyRunnerCfg) -> RslRlOffPolicyRunnerCfg:
     evaluation = cfg.evaluation
     evaluation.num_episodes = 100
     # An evaluation takes as long as four iterations, and before that policies fall too often.
-    evaluation.first_iteration, evaluation.min_interval = 60, 10
+    evaluation.first_iteration, evaluation.min_interval = 80, 10
     evaluation.trigger_return = -math.inf
     evaluation.solved_below = {"lin_vel_error": 0.35, "ang_vel_error": 0.45, "failure_rate": 0.2}
     return cfg
