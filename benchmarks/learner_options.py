@@ -20,26 +20,16 @@ from mjlab.utils.torch import prepare_torch
 
 TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
 ROUNDS, TURN, NUM_ENVS = 6, 2, 512
+_PPO_VARIANTS: dict[str, dict[str, Any]] = {
+    "float32": {},
+    "bfloat16": {"use_mixed_precision": True},
+    "compiled": {"torch_compile_mode": "default"},
+    "bfloat16, compiled": {"use_mixed_precision": True, "torch_compile_mode": "default"},
+}
 # Learner, profile and what is changed of its config, by name. The first of each learner is compared with.
 CASES: dict[str, tuple[tuple[str, str | None], dict[str, dict[str, Any]]]] = {
-    "PPO, 128-64": (
-        ("ppo", "cpu"),
-        {
-            "float32": {},
-            "bfloat16": {"use_mixed_precision": True},
-            "compiled": {"torch_compile_mode": "default"},
-            "bfloat16, compiled": {"use_mixed_precision": True, "torch_compile_mode": "default"},
-        },
-    ),
-    "PPO, 512-256-128": (
-        ("ppo", None),
-        {
-            "float32": {},
-            "bfloat16": {"use_mixed_precision": True},
-            "compiled": {"torch_compile_mode": "default"},
-            "bfloat16, compiled": {"use_mixed_precision": True, "torch_compile_mode": "default"},
-        },
-    ),
+    "PPO, 128-64": (("ppo", "cpu"), _PPO_VARIANTS),
+    "PPO, 512-256-128": (("ppo", None), _PPO_VARIANTS),
     "SAC, 256-128-64": (
         ("sac", None),
         {"float32": {}, "bfloat16": {"use_mixed_precision": True}},

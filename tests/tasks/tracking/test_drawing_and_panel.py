@@ -166,11 +166,21 @@ def test_start_here_puts_robots_exactly_there(env, panel):
     panel.page["All envs"].value = False
     panel.page["Start Here"].set_by_person()
     assert panel.asked[-1] == ("start_here", {"type": "gui_reset", "all_envs": False})
+    forgotten = []
+
+    class Policy:
+        def reset(self, dones=None):
+            forgotten.append(dones.tolist())
+
     viewer = SimpleNamespace(
-        env=env, scene=SimpleNamespace(env_idx=0), after_reset=lambda: panel.asked.append("done")
+        env=env,
+        policy=Policy(),
+        scene=SimpleNamespace(env_idx=0),
+        after_reset=lambda: panel.asked.append("done"),
     )
     ViserPlayViewer._gui_reset(viewer, all_envs=False)
     assert panel.asked[-1] == "done"
+    assert forgotten == [[1.0] + [0.0] * (env.num_envs - 1)]
     # The robot is there, and the reference a frame ahead, as after every reset.
     assert (command.time_steps[0], command.motion_ids[0]) == (111, 0)
     there = command.matching_frame
