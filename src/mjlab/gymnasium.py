@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import gymnasium
 
-from mjlab.tasks.registry import list_tasks
+from mjlab.tasks.registry import list_tasks, load_env_cfg
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -82,7 +82,6 @@ def make_vec_env(
 
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.rl.gymnasium_vector import gymnasium_env
-    from mjlab.tasks.registry import load_env_cfg
 
     cfg = load_env_cfg(task, play=play, profile=profile)
     cfg.scene.num_envs = num_envs

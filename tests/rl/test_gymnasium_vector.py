@@ -13,6 +13,8 @@ import torch
 
 gymnasium = pytest.importorskip("gymnasium")
 
+from rl_ending_env import TASK, ends  # noqa: E402
+
 import mjlab.gymnasium  # noqa: E402
 from mjlab.envs import ManagerBasedRlEnv  # noqa: E402
 from mjlab.managers import (  # noqa: E402
@@ -20,28 +22,17 @@ from mjlab.managers import (  # noqa: E402
     EventTermCfg,
     ObservationGroupCfg,
     ObservationTermCfg,
-    TerminationTermCfg,
 )
 from mjlab.rl import check_vector_env, gymnasium_env  # noqa: E402
 from mjlab.tasks.registry import list_tasks, load_env_cfg  # noqa: E402
 
 NUM_ENVS = 3
-TASK = "Mjlab-Cartpole-Swingup"
 Edit = Callable[[Any], None]
-
-
-def due(steps: list[int]) -> Callable[[Any], torch.Tensor]:
-    """Return a termination in given steps of each environment's episodes."""
-    return lambda env: env.episode_length_buf == torch.tensor(steps)
 
 
 def end_soon(cfg: Any) -> None:
     """End environment 0 by a failure after 3 steps, and 1 by time after 5."""
-    cfg.episode_length_s = 100.0
-    cfg.terminations = {
-        "failed": TerminationTermCfg(func=due([3, 99, 99])),
-        "time_out": TerminationTermCfg(func=due([99, 5, 99]), time_out=True),
-    }
+    ends(cfg, failed=[3, 99, 99], time_out=[99, 5, 99])
 
 
 def go_on(cfg: Any) -> None:

@@ -7,17 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 pytest.importorskip("stable_baselines3")
 
+from rl_ending_env import ending_env
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import VecNormalize
 
-from mjlab.envs import ManagerBasedRlEnv
-from mjlab.managers import TerminationTermCfg
 from mjlab.rl.sb3 import Sb3VecEnv
-from mjlab.tasks.registry import load_env_cfg
 
 NUM_ENVS = 3
 
@@ -27,19 +24,9 @@ def make() -> Iterator[Any]:
     made = []
 
     def make(auto_reset: bool = True, **kwargs: Any) -> Sb3VecEnv:
-        cfg = load_env_cfg("Mjlab-Cartpole-Swingup")
-        cfg.scene.num_envs, cfg.seed, cfg.sim.engine = NUM_ENVS, 5, "native"
-        cfg.auto_reset = auto_reset
-
-        def due(*steps: int) -> Any:
-            return lambda env: env.episode_length_buf == torch.tensor(steps)
-
-        # Environment 0 fails after 3 steps; 1 runs out of time after 4; 2 after 5, as it fails.
-        cfg.terminations = {
-            "failed": TerminationTermCfg(func=due(3, 99, 5)),
-            "time_out": TerminationTermCfg(func=due(99, 4, 5), time_out=True),
-        }
-        made.append(Sb3VecEnv(ManagerBasedRlEnv(cfg, device="cpu"), **kwargs))
+        # Environment 2 runs out of time as it fails.
+        env = ending_env(failed=[3, 99, 5], time_out=[99, 4, 5], auto_reset=auto_reset)
+        made.append(Sb3VecEnv(env, **kwargs))
         return made[-1]
 
     yield make

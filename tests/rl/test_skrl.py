@@ -12,31 +12,18 @@ import torch
 
 pytest.importorskip("skrl")
 
+from rl_ending_env import ending_env
 from skrl.agents.torch import Agent
 
 from mjlab.envs import ManagerBasedRlEnv
-from mjlab.managers import TerminationTermCfg
 from mjlab.rl.skrl import SkrlEnv, with_final_observations
-from mjlab.tasks.registry import load_env_cfg
 
 NUM_ENVS = 3
 
 
 def make_env(auto_reset: bool = True) -> ManagerBasedRlEnv:
-    """Return environments of which 0 fails after 2 steps, 1 runs out of time after 3, and 2 does both
-    after 4."""
-    cfg = load_env_cfg("Mjlab-Cartpole-Swingup")
-    cfg.scene.num_envs, cfg.seed, cfg.sim.engine = NUM_ENVS, 5, "native"
-    cfg.auto_reset = auto_reset
-
-    def due(*steps: int) -> Any:
-        return lambda env: env.episode_length_buf == torch.tensor(steps)
-
-    cfg.terminations = {
-        "failed": TerminationTermCfg(func=due(2, 99, 4)),
-        "time_out": TerminationTermCfg(func=due(99, 3, 4), time_out=True),
-    }
-    return ManagerBasedRlEnv(cfg, device="cpu")
+    """Return environments of which 2 runs out of time as it fails."""
+    return ending_env(failed=[2, 99, 4], time_out=[99, 3, 4], auto_reset=auto_reset)
 
 
 @pytest.fixture

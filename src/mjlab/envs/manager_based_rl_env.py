@@ -419,7 +419,8 @@ class ManagerBasedRlEnv:
         if self.cfg.auto_reset:
             lookups.append(self._ended.plan(self.reset_buf, self.reset_buf))
             if self.observes_ends:
-                lookups.append(self._observed.plan(*self._observed_ends()))
+                ended, excluded = self._observed_ends()
+                lookups.append(self._observed.plan(ended & ~excluded, ended, excluded))
         look_up(lookups)
 
     def _clear_extras(self) -> None:
@@ -436,10 +437,10 @@ class ManagerBasedRlEnv:
         Args:
             moved: (N,) bool, environments in which an event placed something; None for nowhere.
         """
-        ends, *flags = self._observed_ends()
-        ids = self._observed.take(*flags)
+        ended, excluded = self._observed_ends()
+        ids = self._observed.take(ended, excluded)
         if ids is None:
-            ids = ends.nonzero().flatten()
+            ids = (ended & ~excluded).nonzero().flatten()
         if len(ids) == 0:
             return
         with self.sim.looking_ahead(ids):
@@ -455,12 +456,11 @@ class ManagerBasedRlEnv:
         }
         self.extras["final_ids"] = ids
 
-    def _observed_ends(self) -> tuple[torch.Tensor, ...]:
-        """Return which environments are observed as they end, (N,), and what this follows from."""
+    def _observed_ends(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (N,) bool masks: the ends that are observed are those in the first, not in the second."""
         if self.observes_failures:
-            return self.reset_buf & ~self._diverged, self.reset_buf, self._diverged
-        flags = self.reset_time_outs, self.reset_terminated
-        return flags[0] & ~flags[1], *flags
+            return self.reset_buf, self._diverged
+        return self.reset_time_outs, self.reset_terminated
 
     def _reset_done_envs(self) -> torch.Tensor:
         """Reset environments that are done, under `auto_reset`; return their ids."""

@@ -133,27 +133,21 @@ class GymnasiumVectorEnv(VectorEnv):
             Observations, rewards (N,), terminations (N,) bool, truncations (N,) bool, infos.
         """
         actions = as_action(actions, self.env.unwrapped.device)
-        if self._limit is not None:
-            actions = actions.clamp(-self._limit, self._limit)
         before = self._observations
         if not before:
             raise RuntimeError(
                 "step: expected an environment that was reset, got a new one; call reset."
             )
         lengths = self.env.unwrapped.episode_length_buf.clone()
-        self._observations, rewards, terminated, truncated, extras = self.env.step(actions)
+        results = step_env(self.env, actions, self._limit)
+        self._observations, rewards, terminated, truncated, extras = results
         self._returns += rewards
-        if self.env.unwrapped.cfg.is_finite_horizon:
-            terminated, truncated = terminated | truncated, torch.zeros_like(truncated)
         infos: dict[str, Any] = {}
         ended = terminated | truncated
         if self._resets and ended.any():
             self._add_ends(infos, ended, lengths + 1, before, extras)
             self._returns.masked_fill_(ended, 0.0)
-        # The environment's own buffers are written to by the next step.
-        rewards, terminated, truncated = (
-            self._array(value.clone()) for value in (rewards, terminated, truncated)
-        )
+        rewards, terminated, truncated = map(self._array, (rewards, terminated, truncated))
         return self._shown(self._observations), rewards, terminated, truncated, infos
 
     def _start_over(self) -> None:
@@ -223,6 +217,34 @@ class GymnasiumVectorEnv(VectorEnv):
 
     def _array(self, value: torch.Tensor) -> Any:
         return value if self._tensors else value.cpu().numpy()
+
+
+def step_env(
+    env: Any, actions: torch.Tensor, limit: float | None
+) -> tuple[dict[str, Any], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
+    """Step a `ManagerBasedRlEnv` for a library that keeps the results.
+
+    Args:
+        env: The environment.
+        actions: Shape (N, A).
+        limit: Actions are clamped to plus and minus this; None: they are not.
+
+    Returns:
+        The results of `env.step`, which later steps do not write to. With `is_finite_horizon`, episodes
+        that run out of time are terminated and not truncated.
+    """
+    if limit is not None:
+        actions = actions.clamp(-limit, limit)
+    observations, rewards, terminated, truncated, extras = env.step(actions)
+    if env.unwrapped.cfg.is_finite_horizon:
+        return (
+            observations,
+            rewards.clone(),
+            terminated | truncated,
+            torch.zeros_like(truncated),
+            extras,
+        )
+    return observations, rewards.clone(), terminated.clone(), truncated.clone(), extras
 
 
 # Spaces.

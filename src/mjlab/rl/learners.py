@@ -49,20 +49,17 @@ def with_learner(cfg: RslRlBaseRunnerCfg, learner: Learner) -> RslRlBaseRunnerCf
     check_learner(learner)
     if learner_of(cfg) == learner:
         return cfg
-    base = {field.name: getattr(cfg, field.name) for field in fields(RslRlBaseRunnerCfg)}
+    base = _shared_fields(cfg, learner)
     if learner == "distillation":
         return _distillation(cfg, base)
-    if learner_of(cfg) == "distillation":
-        # Groups of other networks.
-        del base["obs_groups"]
     symmetry = getattr(getattr(cfg, "algorithm", None), "symmetry_cfg", None)
     if learner == "sac":
         _check_networks_are_plain(cfg)
-        off_policy = RslRlOffPolicyRunnerCfg(**copy.deepcopy(base))
+        off_policy = RslRlOffPolicyRunnerCfg(**base)
         if symmetry:
             off_policy.algorithm.symmetry_cfg = {_MIRROR_FUNCTION: symmetry[_MIRROR_FUNCTION]}
         return off_policy
-    on_policy = RslRlOnPolicyRunnerCfg(**copy.deepcopy(base))
+    on_policy = RslRlOnPolicyRunnerCfg(**base)
     if symmetry:
         on_policy.algorithm.symmetry_cfg = {**symmetry, "use_data_augmentation": True}
     return on_policy
@@ -76,7 +73,7 @@ def _distillation(cfg: RslRlBaseRunnerCfg, base: dict[str, Any]) -> RslRlDistill
         )
     teacher: RslRlModelCfg = copy.deepcopy(getattr(cfg, "actor", RslRlModelCfg()))
     groups = cfg.obs_groups.get("actor", ("actor",))
-    made = RslRlDistillationRunnerCfg(**copy.deepcopy(base))
+    made = RslRlDistillationRunnerCfg(**base)
     made.obs_groups = {"student": groups, "teacher": groups}
     steps = made.num_steps_per_env
     made.algorithm.gradient_length = max(k for k in range(1, 9) if steps % k == 0)
@@ -92,12 +89,23 @@ def for_task_of(cfg: RslRlBaseRunnerCfg, other: RslRlBaseRunnerCfg) -> RslRlBase
     are the observation groups if the networks have other names.
     """
     cfg = copy.deepcopy(cfg)
-    names = {learner_of(one) == "distillation" for one in (cfg, other)}
-    kept = _PACE if len(names) == 1 else _PACE | {"obs_groups"}
-    for field in fields(RslRlBaseRunnerCfg):
-        if field.name not in kept:
-            setattr(cfg, field.name, copy.deepcopy(getattr(other, field.name)))
+    for name, value in _shared_fields(other, learner_of(cfg)).items():
+        if name not in _PACE:
+            setattr(cfg, name, value)
     return cfg
+
+
+def _shared_fields(cfg: RslRlBaseRunnerCfg, learner: Learner) -> dict[str, Any]:
+    """Return copies of the fields of `cfg` that a config of `learner` has too.
+
+    Not the observation groups if the networks have other names.
+    """
+    shared = {
+        field.name: copy.deepcopy(getattr(cfg, field.name)) for field in fields(RslRlBaseRunnerCfg)
+    }
+    if (learner_of(cfg) == "distillation") != (learner == "distillation"):
+        del shared["obs_groups"]
+    return shared
 
 
 def acting_cfg(cfg: RslRlBaseRunnerCfg) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import gymnasium
 import torch
 from skrl.envs.wrappers.torch import Wrapper
 
-from mjlab.rl.gymnasium_vector import action_space, observation_space
+from mjlab.rl.gymnasium_vector import action_space, observation_space, step_env
 
 if TYPE_CHECKING:
     from skrl.agents.torch import Agent
@@ -90,11 +90,8 @@ class SkrlEnv(Wrapper):
         Returns:
             Observations; rewards, terminated and truncated (N, 1); infos.
         """
-        if self._limit is not None:
-            actions = actions.clamp(-self._limit, self._limit)
-        self._observations, rewards, terminated, truncated, extras = self._env.step(actions)
-        if self._unwrapped.cfg.is_finite_horizon:
-            terminated = terminated | truncated
+        results = step_env(self._env, actions, self._limit)
+        self._observations, rewards, terminated, truncated, extras = results
         # skrl bootstraps wherever an episode is truncated, also where it failed in the same step.
         truncated = truncated & ~terminated
         infos: dict[str, Any] = {"log": dict(extras["log"]), "num_envs": len(rewards)}
@@ -103,9 +100,8 @@ class SkrlEnv(Wrapper):
             infos["final_ids"] = extras["final_ids"]
             infos["final_observations"] = final[self._group]
             infos["final_states"] = final[self._state_group] if self._state_group else None
-        # The environment's own buffers are written to by the next step.
         rewards, terminated, truncated = (
-            value.clone().view(-1, 1) for value in (rewards, terminated, truncated)
+            value.view(-1, 1) for value in (rewards, terminated, truncated)
         )
         return self._observations[self._group], rewards, terminated, truncated, infos
 

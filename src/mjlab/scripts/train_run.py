@@ -161,6 +161,8 @@ def _train(
         keep_number_of_environments(task, cfg, checkpoint)
     else:
         suggest_profile(task, cfg.profile, device)
+    with same_fate():
+        prepare_teacher(task, cfg.agent, checkpoint)
     with _run_folder(cfg, rank, output) as folder:
         with same_fate():
             fetched_from = None if checkpoint is None else cfg.wandb_run_path
@@ -174,7 +176,6 @@ def _train(
             print(f"Task:    {task}, {env.num_envs} environments{each}{under}")
             print(f"Physics: {env.unwrapped.sim.capabilities.description}", flush=True)
             with same_fate():
-                prepare_teacher(task, cfg.agent, checkpoint)
                 runner = _build_runner(task, cfg, env, folder.path, device)
                 if checkpoint is not None:
                     runner.load(str(checkpoint))

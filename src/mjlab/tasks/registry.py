@@ -156,9 +156,9 @@ def load_rl_cfg(
     Args:
         task_name: Name of the task.
         profile: One of the task's profiles, which is applied to it; None applies none.
-        learner: `ppo`, `sac` or `distillation`; None takes what the task, or the profile, chooses. If the profile
-            replaces the task's own config, and that is of `learner`, it is taken, with what the
-            profile says of the task. Otherwise it is made by `mjlab.rl.learners.with_learner`.
+        learner: `ppo`, `sac` or `distillation`; None takes what the task, or the profile, chooses.
+            If the profile replaces the task's own config, and that is of `learner`, it is taken, with
+            what the profile says of the task. Otherwise it is made by `mjlab.rl.learners.with_learner`.
 
     Raises:
         UnknownTaskError, UnknownProfileError, TaskImportError: see `load_env_cfg`.
