@@ -33,8 +33,8 @@ def actions(steps: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("field", ["qpos", "qvel"])
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_an_environment_whose_state_is_not_finite_starts_anew_and_is_counted(env, field, value):
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e12])
+def test_an_environment_in_a_bad_state_is_reset_and_counted(env, field, value):
     env.step(actions(1)[0])
     getattr(env.sim.data, field)[BROKEN, 1] = value
     observations, reward, terminated, truncated, extras = env.step(actions(1)[0])
@@ -44,6 +44,7 @@ def test_an_environment_whose_state_is_not_finite_starts_anew_and_is_counted(env
     assert not truncated.any()
     assert extras["log"]["Simulation/nan_resets"] == 1
     assert torch.isfinite(reward).all()
+    assert reward[BROKEN] == 0
     assert torch.isfinite(observations["actor"]).all()
     assert env.episode_length_buf[BROKEN] == 0
     # The episode began where episodes begin: at rest, hanging down.
@@ -51,6 +52,40 @@ def test_an_environment_whose_state_is_not_finite_starts_anew_and_is_counted(env
     _, _, terminated, _, extras = env.step(actions(1)[0])
     assert not terminated.any()
     assert extras["log"]["Simulation/nan_resets"] == 0
+
+
+@pytest.mark.parametrize("engine", ["native", "warp"])
+def test_states_beyond_the_limit_of_mujoco_reach_no_reward(engine):
+    """They are finite: without the limit, a stiff robot had rewards of -1e27 and no reset."""
+    pytest.importorskip("mujoco_warp")
+    env = make_env(engine)
+    name = env.reward_manager.active_terms[0]
+    env.reward_manager.get_term_cfg(name).func = lambda env, **_: env.sim.data.qvel.square().sum(1)
+    env.sim.data.qvel[BROKEN, 1] = 1e15
+    _, reward, terminated, _, extras = env.step(actions(1)[0])
+    assert terminated.tolist() == [index == BROKEN for index in range(NUM_ENVS)]
+    assert extras["log"]["Simulation/nan_resets"] == 1
+    assert extras["log"]["Simulation/nan_rewards"] == 0
+    assert reward[BROKEN] == 0
+    assert reward.abs().max() < 1e6
+    assert env.nan_resets.tolist() == terminated.int().tolist()
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "named"),
+    [("qpos", float("nan"), "not finite"), ("qvel", 1e15, "joint 'cartpole/hinge_1'")],
+)
+def test_the_first_divergence_is_logged_with_environment_and_joint(
+    env, caplog, field, value, named
+):
+    for index in (BROKEN, 0):
+        getattr(env.sim.data, field)[index, 1] = value
+        env.step(actions(1)[0])
+    told = [record.getMessage() for record in caplog.records if "diverged" in record.getMessage()]
+    assert len(told) == 1
+    for part in (f"environment {BROKEN}", "step 1", named, "Simulation/nan_resets"):
+        assert part in told[0]
 
 
 def test_the_other_environments_go_on_as_if_nothing_had_happened():

@@ -7,7 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mjlab.rl.plot import DEFAULT_TAG, mean_and_std, plot_run, plot_seeds, read_scalars
+from mjlab.rl.plot import (
+    DEFAULT_TAG,
+    mean_and_std,
+    plot_run,
+    plot_seeds,
+    read_scalars,
+    visible_range,
+)
 
 
 def write_run(folder: Path, values: dict[int, float], tag: str = DEFAULT_TAG) -> Path:
@@ -59,3 +66,24 @@ def test_wrong_folders_tags_and_empty_lists_are_named(tmp_path: Path):
         plot_run(run, tag="Train/nothing")
     with pytest.raises(ValueError, match="at least one"):
         plot_seeds([], tmp_path / "none.png")
+
+
+def test_one_outlier_does_not_hide_the_curve():
+    curve = np.concatenate([np.linspace(0.0, 1.0, 60), [1e27], np.linspace(1.0, 2.0, 60)])
+    low, high = visible_range(curve)
+    assert -0.2 < low <= 0.1
+    assert 1.9 <= high < 2.2
+
+
+@pytest.mark.parametrize(
+    "curve",
+    [
+        np.linspace(0.0, 1.0, 50),
+        np.concatenate([np.zeros(95), np.full(5, 900.0)]),
+        np.array([1.0, 1e9]),
+        np.full(20, 3.0),
+        np.array([]),
+    ],
+)
+def test_what_a_curve_shows_stays_in_sight(curve):
+    assert visible_range(curve) is None

@@ -203,6 +203,22 @@ def test_a_state_that_turns_nan_is_counted_and_the_run_goes_on(run, tmp_path, mo
     assert all(torch.isfinite(value).all() for value in weights(run_dir / "model_1.pt").values())
     assert list(dumps.glob("*.npz"))
     assert str(dumps) in outcome.err + outcome.out
+    assert "1 of 16 environments" in outcome.out, "the end says how many environments diverged"
+    assert "'cartpole/" in outcome.err, "the joint is named"
+
+
+def test_physics_that_diverges_nearly_everywhere_ends_training(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    outcome = run(
+        "train", TASK, "--num-envs", "16", "--device", "cpu", "--agent.max-iterations", "2",
+        "--env.sim.mujoco.timestep", "100", "--env.episode-length-s", "1e5",
+        "--env.sim.mujoco.integrator", "euler", "--log-root", str(tmp_path / "logs"),
+    )  # fmt: skip
+    assert outcome.status == 1
+    assert "diverged" in outcome.err
+    assert "timestep" in outcome.err
+    assert len(outcome.err) < 10_000
+    assert [path.name for path in tmp_path.iterdir()] == ["logs"], "MuJoCo wrote its own log"
 
 
 def test_training_stops_by_itself_once_solved(train, tmp_path):

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from mjlab.envs import env_state
+from mjlab.envs.divergence import DivergenceLog
 from mjlab.envs.env_cfg import ManagerBasedRlEnvCfg as ManagerBasedRlEnvCfg
 from mjlab.envs.env_checks import as_action, as_reset_ids, check_device, check_env_cfg
 from mjlab.envs.types import VecEnvObs, VecEnvStepReturn
@@ -100,7 +101,9 @@ class ManagerBasedRlEnv:
         self._sim_step_counter = 0
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=device)
         self._pending_reset = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
+        self.diverged = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
         self._nan_resets = torch.zeros(self.num_envs, dtype=torch.long, device=device)
+        self._divergence_log = DivergenceLog(self.sim)
         # What `_command_dt` returns in a step with resets. Kept, because torch counts no writes to a
         # tensor made under `inference_mode`, and by these a `Lookup` knows that it is valid.
         self._command_dts = torch.zeros(self.num_envs, dtype=torch.float32, device=device)
@@ -150,6 +153,11 @@ class ManagerBasedRlEnv:
         """Length of an episode, in environment steps."""
         # The small number keeps 0.14 s / 0.02 s, which is 7.0000000000000001, at 7 steps.
         return math.ceil(self.max_episode_length_s / self.step_dt - 1e-6)
+
+    @property
+    def nan_resets(self) -> torch.Tensor:
+        """Number of episodes that ended because the physics diverged, (N,) int64."""
+        return self._nan_resets
 
     @property
     def unwrapped(self) -> ManagerBasedRlEnv:
@@ -296,12 +304,16 @@ class ManagerBasedRlEnv:
           positions or mocap pose, by a writer of `Entity`). Contact histories and air times begin
           with the first substep after a reset.
 
+        Where the physics diverged (positions, velocities or accelerations that are not finite, or
+        beyond MuJoCo's `mjMAXVAL` of 1e10), the episode terminates, and the reward of the step is zero.
+        `diverged` (N,) bool are these environments, `nan_resets` (N,) counts their episodes.
+
         A command that writes positions, and a term that writes `sim.data` itself, runs
         `sim.forward(env_ids)`, on the environments concerned.
 
         With `observes_ends` and `auto_reset`, steps in which episodes run out of time (truncated and
         not terminated) observe these k environments before they are reset; with `observes_failures`
-        too, all that end, but those whose state is not finite.
+        too, all that end, but those whose physics diverged.
         `extras["final_observations"]` is what `step` would have returned for them had the episodes
         gone on, group to (k, ...), and `extras["final_ids"]` are their ids (k,), ascending. Only
         commands are those that acted in the step: they have neither advanced nor been redrawn.
@@ -328,13 +340,18 @@ class ManagerBasedRlEnv:
         if not self._holds_common_steps:
             self.common_step_counter += 1
 
+        self.diverged = self.sim.bad_states()
+        for manager in (self.termination_manager, self.reward_manager):
+            manager.nonfinite.begin_step(self.diverged, self.common_step_counter)
         self.reset_buf = self.termination_manager.compute()
         self.reset_terminated = self.termination_manager.terminated
         self.reset_time_outs = self.termination_manager.time_outs
         self._terminate_diverged()
         self.reward_buf = self.reward_manager.compute(dt=self.step_dt)
+        self._log_not_finite()
         self.metrics_manager.compute()
         self._look_ahead()
+        self._divergence_log.end_step(self.diverged, self.common_step_counter)
         for mode in ("step", "interval"):
             if mode in self.event_manager.available_modes:
                 self.event_manager.apply(mode=mode, dt=self.step_dt)
@@ -378,6 +395,7 @@ class ManagerBasedRlEnv:
             self._holds_common_steps = held
 
     def _run_physics(self) -> None:
+        self._divergence_log.begin_step()
         substeps = self.cfg.decimation
         if self._steps_as_one:
             self._sim_step_counter += substeps
@@ -396,14 +414,16 @@ class ManagerBasedRlEnv:
             self.metrics_manager.compute_substep()
 
     def _terminate_diverged(self) -> None:
-        """End the episode of environments whose state is not finite, and count them."""
-        # A sum is finite only if every summand is. `isfinite` takes twice the operations.
-        checksum = self.sim.data.qpos.sum(dim=1) + self.sim.data.qvel.sum(dim=1)
-        self._diverged = diverged = ~(checksum.abs() < math.inf)
-        self.reset_terminated |= diverged
-        self.reset_buf |= diverged
-        self._nan_resets += diverged
-        self.extras["log"]["Simulation/nan_resets"] = diverged.sum()
+        """End the episode of environments whose physics diverged, and count them."""
+        self.reset_terminated |= self.diverged
+        self.reset_buf |= self.diverged
+        self._nan_resets += self.diverged
+
+    def _log_not_finite(self) -> None:
+        log = self.extras["log"]
+        log["Simulation/nan_resets"] = self.diverged.sum()
+        log["Simulation/nan_rewards"] = self.reward_manager.nonfinite.count
+        log["Simulation/nan_terminations"] = self.termination_manager.nonfinite.count
 
     def _look_ahead(self) -> None:
         """On a GPU, look up in one wait which environments end, and are due for events and commands.
@@ -415,6 +435,7 @@ class ManagerBasedRlEnv:
         lookups = [
             *self.event_manager.plan_lookups(self.step_dt),
             *self.command_manager.plan_lookups(self.step_dt),
+            *self._divergence_log.plan_lookups(self.diverged),
         ]
         if self.cfg.auto_reset:
             lookups.append(self._ended.plan(self.reset_buf, self.reset_buf))
@@ -459,7 +480,7 @@ class ManagerBasedRlEnv:
     def _observed_ends(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (N,) bool masks: the ends that are observed are those in the first, not in the second."""
         if self.observes_failures:
-            return self.reset_buf, self._diverged
+            return self.reset_buf, self.diverged
         return self.reset_time_outs, self.reset_terminated
 
     def _reset_done_envs(self) -> torch.Tensor:

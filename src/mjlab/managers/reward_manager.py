@@ -14,6 +14,7 @@ import torch
 from mjlab.managers.debug_vis import TermFunctionSwitches
 from mjlab.managers.env_ids import as_index, is_empty
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
+from mjlab.managers.nonfinite import NonFiniteWatch
 from mjlab.managers.unready_term import UnreadyTerm
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ class RewardManager(TermFunctionSwitches, TermListManager):
 
     _cfg_type = RewardTermCfg
     # Views of `_rates`.
-    _transient = {"_step_reward", "_rows", "_scale_by_dt"}
+    _transient = {"_step_reward", "_rows", "_scale_by_dt", "nonfinite"}
 
     def __init__(
         self,
@@ -62,14 +63,17 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         self._episode_sums = torch.zeros(size, dtype=torch.float32, device=self.device)
         self._reward_buf = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._rows = list(self._rates)
+        labels = [self._label(name) for name in self._term_names]
+        self.nonfinite = NonFiniteWatch(labels, "0", self.num_envs, self.device)
         # Weighted rates (num_envs, terms) of the last step, not multiplied by its duration.
         self._step_reward = self._rates.t()
 
     def compute(self, dt: float) -> torch.Tensor:
         """Return the reward (num_envs,) of a step of `dt` seconds, in a buffer used every step.
 
-        A term that is NaN or infinite in an environment counts as 0 there. Raises `ValueError`
-        if a term returns another shape than (num_envs,).
+        A term that is NaN or infinite in an environment counts as 0 there, and is logged the first
+        time. In environments whose physics diverged (`nonfinite.excluded`), all terms are 0. Raises
+        `ValueError` if a term returns another shape than (num_envs,).
         """
         for name, cfg, row in zip(self._term_names, self._term_cfgs, self._rows, strict=True):
             if cfg.weight == 0.0:
@@ -78,7 +82,10 @@ class RewardManager(TermFunctionSwitches, TermListManager):
             value = cfg.func(self._env, **cfg.params)
             self._check_value(name, value)
             torch.mul(value, cfg.weight, out=row)
-        torch.nan_to_num_(self._rates, nan=0.0, posinf=0.0, neginf=0.0)
+        self._rates.masked_fill_(self.nonfinite.excluded, 0.0)
+        bad = self.nonfinite.look(self._rates)
+        if bad is not None:
+            self._rates.masked_fill_(bad, 0.0)
         scale = dt if self._scale_by_dt else 1.0
         self._episode_sums.add_(self._rates, alpha=scale)
         # One after the other: the sum then has the same bits for any number of threads.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -11,9 +12,12 @@ import torch
 from mjlab.compat import offers_older_attributes
 from mjlab.managers.env_ids import as_index, is_empty
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
+from mjlab.managers.nonfinite import NonFiniteWatch
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -30,7 +34,7 @@ class TerminationManager(TermListManager):
     """Decides which episodes end. All results are buffers that the next step overwrites."""
 
     _cfg_type = TerminationTermCfg
-    _transient = {"_rows"}
+    _transient = {"_rows", "_numbers", "_numeric", "nonfinite"}
 
     def __init__(
         self, cfg: Mapping[str, TerminationTermCfg | None], env: ManagerBasedRlEnv
@@ -43,6 +47,11 @@ class TerminationManager(TermListManager):
         self._values = falses(len(self._term_names))
         self._rows = list(self._values)
         self._terminated, self._time_outs, self._dones = falses(), falses(), falses()
+        labels = [self._label(name) for name in self._term_names]
+        self.nonfinite = NonFiniteWatch(labels, "true", self.num_envs, self.device)
+        # Values of terms that return floats, (terms, num_envs), and which terms these are.
+        self._numbers: torch.Tensor | None = None
+        self._numeric: set[int] = set()
 
     @property
     def dones(self) -> torch.Tensor:
@@ -62,16 +71,32 @@ class TerminationManager(TermListManager):
     def compute(self) -> torch.Tensor:
         """Evaluate all terms and return `dones`.
 
-        Raises `ValueError` if a term returns another shape than (num_envs,).
+        A term that returns floats is logged the first time: what is not 0 counts as true, also NaN. Raises `ValueError` if a term returns another shape than (num_envs,).
         """
         self._terminated.zero_()
         self._time_outs.zero_()
-        for name, cfg, row in zip(self._term_names, self._term_cfgs, self._rows, strict=True):
+        terms = zip(self._term_names, self._term_cfgs, self._rows, strict=True)
+        for k, (name, cfg, row) in enumerate(terms):
             value = cfg.func(self._env, **cfg.params)
             self._check_value(name, value)
+            if value.is_floating_point():
+                self._take_numbers(k, name, value)
             row.copy_(value)
             (self._time_outs if cfg.time_out else self._terminated).logical_or_(row)
+        if self._numbers is not None:
+            self.nonfinite.look(self._numbers)
         return torch.logical_or(self._terminated, self._time_outs, out=self._dones)
+
+    def _take_numbers(self, k: int, name: str, value: torch.Tensor) -> None:
+        if self._numbers is None:
+            self._numbers = torch.zeros(self._values.shape, device=self.device)
+        if k not in self._numeric:
+            self._numeric.add(k)
+            logger.warning(
+                "%s returned %s, expected bool: what is not 0 counts as true. Compare the value in the "
+                "term.", self._label(name), str(value.dtype).removeprefix("torch."),
+            )  # fmt: skip
+        self._numbers[k] = value
 
     def get_term(self, name: str) -> torch.Tensor:
         """Return the last value of a term, (num_envs,) bool.

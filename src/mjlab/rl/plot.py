@@ -189,6 +189,23 @@ def mean_and_std(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, np.nd
     return iterations, values.mean(axis=0), std
 
 
+def visible_range(values: np.ndarray) -> tuple[float, float] | None:
+    """Return the range of an axis that one value in a hundred would blow up; None if none does.
+
+    It is that of the values without the highest and the lowest hundredth, at least one of each, if the
+    range of all is 20 times as wide. Values that are not finite do not count.
+    """
+    values = np.sort(values[np.isfinite(values)])
+    cut = max(1, len(values) // 100)
+    if len(values) < 2 * cut + 2:
+        return None
+    low, high = float(values[cut]), float(values[-cut - 1])
+    if not 0 < 20 * (high - low) < values[-1] - values[0]:
+        return None
+    margin = 0.05 * (high - low)
+    return low - margin, high + margin
+
+
 def _draw_figure(
     draw: Callable[[Axes], None], output: Path, title: str, xlabel: str, ylabel: str
 ) -> None:
@@ -200,6 +217,13 @@ def _draw_figure(
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     draw(axes)
+    values = np.concatenate(
+        [np.asarray(line.get_ydata(), float) for line in axes.lines] or [np.zeros(0)]
+    )
+    if (limits := visible_range(values)) is not None:
+        axes.set_ylim(limits)
+        beyond = int(((values < limits[0]) | (values > limits[1])).sum())
+        axes.set_title(f"{beyond} beyond the axis", loc="right", fontsize="small")
     axes.set_xlabel(xlabel)
     axes.set_ylabel(ylabel)
     axes.set_title(title)

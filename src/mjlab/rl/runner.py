@@ -22,7 +22,7 @@ from mjlab.rl.checkpoint import (
     save_checkpoint,
 )
 from mjlab.rl.distributed import join_processes
-from mjlab.rl.divergence import SpeedWatch
+from mjlab.rl.divergence import RolloutWatch
 from mjlab.rl.evaluate import reward_unit
 from mjlab.rl.evaluation_result import EvaluationResult
 from mjlab.rl.exporter_utils import attach_metadata_to_onnx, get_base_metadata
@@ -130,7 +130,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         # Beside the threads of the physics, waiting ones of OpenMP cost more than they bring.
         on_cpu = torch.device(self.device).type == "cpu"
         self._num_collecting_threads = 1 if on_cpu else self._num_threads
-        self._speeds = SpeedWatch(self.env.unwrapped)
+        self._watch = RolloutWatch(self.env.unwrapped)
 
     # The training loop.
 
@@ -209,10 +209,11 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 return reason
         for iteration in range(first, total):
             begin = time.perf_counter()
-            with self._speeds.explaining(self.alg.get_policy()):
+            with self._watch.explaining(self.alg.get_policy()):
                 with torch.inference_mode():
                     with using_torch_threads(self._num_collecting_threads):
                         observations = self._collect(observations)
+                        self._watch.check(self.cfg["num_steps_per_env"])
                     collected = time.perf_counter()
                     self.alg.compute_returns(observations)
                 losses = self._update()
@@ -232,11 +233,11 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     def _collect(self, observations: TensorDict) -> TensorDict:
         """Step all environments `num_steps_per_env` times; return the last observations."""
         check_every_step = self.cfg.get("check_for_nan", True)
-        self._speeds.start()
+        self._watch.start()
         for _ in range(self.cfg["num_steps_per_env"]):
             actions = self.alg.act(observations)
             observations, rewards, dones, extras = self.env.step(actions.to(self.env.device))
-            self._speeds.update()
+            self._watch.update()
             if check_every_step:
                 check_nan(observations, rewards, dones)
             observations = observations.to(self.device)

@@ -38,6 +38,7 @@ from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 from mjlab.utils.processes import ProcessRank, cores_per_process, process_rank
 
 if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
     from mjlab.rl import MjlabOnPolicyRunner
 
 logger = logging.getLogger(__name__)
@@ -189,6 +190,8 @@ def _train(
             if rank.is_first:
                 _write_params(task, cfg, folder.path, checkpoint)
             _learn(task, cfg, runner, folder)
+            if rank.is_first:
+                _tell_of_divergence(env.unwrapped)
         finally:
             env.close()
     if rank.is_first:
@@ -351,6 +354,16 @@ def _learn(
                 ended=runner.stop_reason,
                 iterations=runner.current_learning_iteration,
             )
+
+
+def _tell_of_divergence(env: ManagerBasedRlEnv) -> None:
+    episodes = int(env.nan_resets.sum())
+    if episodes > 0:
+        environments = int((env.nan_resets > 0).sum())
+        print(
+            f"Diverged: the physics of {environments} of {env.num_envs} environments, in {episodes} "
+            "episodes (Simulation/nan_resets)"
+        )
 
 
 def _leave_results(task: str, cfg: TrainConfig, run_dir: Path, device: str) -> None:

@@ -225,6 +225,8 @@ class Engine(ABC):
     capabilities: Capabilities
     model_fields: dict[str, torch.Tensor]
     """Live (N, ...) tensors of the `MjModel` (and `MjOption`) fields that are expanded."""
+    judged_fields: tuple[str, ...] = ("qpos", "qvel")
+    """`MjData` fields that `bad_states` looks at."""
 
     @abstractmethod
     def data_field(self, name: str) -> torch.Tensor:
@@ -312,6 +314,19 @@ class Engine(ABC):
 
         Derived fields and model fields keep their values until `forward`.
         """
+
+    def bad_states(self) -> torch.Tensor:
+        """Return where the last step left a state that MuJoCo calls bad, (N,) bool.
+
+        Positions, velocities or accelerations are not finite, or beyond `mjMAXVAL` (1e10).
+        """
+        bad = torch.zeros(self.num_envs, dtype=torch.bool, device=self.data_field("qpos").device)
+        for name in self.judged_fields:
+            values = self.data_field(name)
+            if values.shape[1] > 0:
+                # Comparisons with NaN are false.
+                bad |= ~(values.abs().amax(dim=1) <= mujoco.mjMAXVAL)
+        return bad
 
     @abstractmethod
     def raycast(self, query: RayQuery) -> RayHits:

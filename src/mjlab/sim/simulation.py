@@ -28,6 +28,7 @@ from mjlab.sim.engine import (
 )
 from mjlab.sim.randomization import RecomputeLevel, VariantInfo, VariantValues, is_structure
 from mjlab.sim.sim_data import FieldView
+from mjlab.sim.warning_log import collect_mujoco_warnings
 from mjlab.utils.mujoco import moving_dofs
 from mjlab.utils.nan_guard import NanGuard
 from mjlab.utils.spec import compile_spec
@@ -131,6 +132,7 @@ class Simulation:
         if (model is None) == (spec is None):
             raise ValueError("Give Simulation exactly one of `model` and `spec`.")
         engine_name = resolve_engine_name(cfg.engine, device)
+        collect_mujoco_warnings()
         self.num_envs = num_envs
         self.cfg = cfg
         self.device = device
@@ -399,6 +401,13 @@ class Simulation:
             undo.callback(self._engine.look_back, env_ids, before)
             self._tell_forward("vel")
             yield
+
+    def bad_states(self) -> torch.Tensor:
+        """Return where the last step left a state that MuJoCo calls bad, (N,) bool.
+
+        Positions, velocities or accelerations are not finite, or beyond `mjMAXVAL` (1e10).
+        """
+        return self._engine.bad_states()
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Put environments into the model's initial state: time 0, `qpos0`, the rest zero.

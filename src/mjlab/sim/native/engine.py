@@ -90,6 +90,12 @@ _WITHOUT_CONSTRAINTS = int(
     mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
 )
 
+_BAD_STATES = [
+    int(mujoco.mjtWarning.mjWARN_BADQPOS),
+    int(mujoco.mjtWarning.mjWARN_BADQVEL),
+    int(mujoco.mjtWarning.mjWARN_BADQACC),
+]
+
 # Matrices of implicit integration, which only a step computes.
 _STEP_FIELDS = frozenset({"qH", "qHDiagInv", "qDeriv", "qLU"})
 # Outputs that a stage does not compute.
@@ -325,6 +331,12 @@ class NativeEngine(Engine):
         for name in self._outputs.keys() - _LATER_FIELDS[stage]:
             columns = self._sensor_columns[stage] if name == "sensordata" else None
             self._outputs[name].copy_out(rows, columns)
+
+    def bad_states(self) -> torch.Tensor:
+        # Counted since the reset. MuJoCo looks at each substep, and at accelerations, which are not
+        # copied unless they are read.
+        warned = self._batch.warning[:, _BAD_STATES, 0].any(axis=1)
+        return super().bad_states() | torch.from_numpy(warned)
 
     def look_ahead(self, env_ids: torch.Tensor) -> Any:
         fields = {name: field.values[env_ids] for name, field in self._outputs.items()}

@@ -102,6 +102,8 @@ class WarpEngine(Engine):
     `wp_model`, `wp_data` and `wp_device` are MuJoCo Warp's own, for code that knows it.
     """
 
+    judged_fields = ("qpos", "qvel", "qacc")
+
     # What is made here is written into later, in whatever mode torch is then.
     @torch.inference_mode(False)
     def __init__(

@@ -1,0 +1,71 @@
+"""Environments whose physics diverged: the first is named with its joint."""
+
+from __future__ import annotations
+
+import logging
+
+import torch
+
+from mjlab.managers.lookup import Lookup
+from mjlab.sim import Simulation
+from mjlab.sim.divergence import cure_of, describe_dof, fastest_dof
+
+logger = logging.getLogger(__name__)
+
+
+class DivergenceLog:
+    """Logs the first divergence of an environment, with the joint that blew up.
+
+    Attributes:
+        is_done: True once that was logged; nothing is watched then.
+    """
+
+    def __init__(self, sim: Simulation) -> None:
+        self.is_done = False
+        self._sim = sim
+        self._velocities = sim.data.qvel.clone()
+        self._found = Lookup()
+
+    def begin_step(self) -> None:
+        """Keep the velocities from which the physics starts."""
+        if not self.is_done:
+            self._velocities.copy_(self._sim.data.qvel)
+
+    def plan_lookups(self, diverged: torch.Tensor) -> list[Lookup]:
+        """Return what to look up on a GPU before `end_step`."""
+        return [] if self.is_done else [self._found.plan(diverged, diverged)]
+
+    def end_step(self, diverged: torch.Tensor, step: int) -> None:
+        """Log an environment of the mask `diverged` (N,), if there is one, before it is reset."""
+        if self.is_done:
+            return
+        ids = self._found.take(diverged)
+        if ids is None:
+            ids = diverged.nonzero().flatten()
+        if len(ids) == 0:
+            return
+        self.is_done = True
+        env = int(ids[0])
+        joint, cure = self._find_joint(env)
+        logger.warning(
+            "The physics of environment %d diverged in step %d: %s. Its episode ended with zero reward "
+            "for that step. Further ones are counted as Simulation/nan_resets. %s",
+            env, step, joint, cure,
+        )  # fmt: skip
+
+    def _find_joint(self, env: int) -> tuple[str, str]:
+        """Return the joint with what is wrong with it, and the cure."""
+        model = self._sim.mj_model
+        velocity = self._sim.data.qvel[env]
+        if not bool(torch.isfinite(velocity).any()):
+            # One joint makes all of its tree NaN within a step.
+            velocity = self._velocities[env]
+        speeds = velocity.abs().tolist()
+        dof, motion = fastest_dof(model, speeds)
+        if motion <= 1.0:
+            # Within the step, or something wrote such a state.
+            return "its state is not finite", (
+                "Use a smaller sim.mujoco.timestep (now "
+                f"{float(model.opt.timestep):g} s) unless a term or an event wrote this state."
+            )
+        return describe_dof(model, dof, speeds[dof]), cure_of(model, dof)
