@@ -89,6 +89,73 @@ def test_a_truncated_checkpoint_is_called_so(tmp_path: Path, keep):
         load_checkpoint(path)
 
 
+def test_a_flipped_bit_is_refused_or_changes_nothing(tmp_path: Path):
+    path = tmp_path / "model_0.pt"
+    generator = torch.Generator().manual_seed(0)
+    data = {"weights": torch.randn(300, generator=generator), "iter": 3, "lr": 1e-3}
+    save_checkpoint(data, path)
+    whole = path.read_bytes()
+    draw, refused = random.Random(0), 0
+    for _ in range(300):
+        flipped = bytearray(whole)
+        flipped[draw.randrange(len(whole))] ^= 1 << draw.randrange(8)
+        path.write_bytes(flipped)
+        try:
+            loaded = load_checkpoint(path)
+        except CheckpointError:
+            refused += 1
+        else:
+            assert torch.equal(loaded["weights"], data["weights"])
+            assert (loaded["iter"], loaded["lr"]) == (3, 1e-3)
+    # Most of the file is weights; the rest is padding.
+    assert refused > 100
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("part", ["actor_state_dict", "critic_state_dict", "moment", "lr"])
+def test_weights_and_rates_that_are_not_finite_are_refused(make_runner, tmp_path, part, value):
+    runner = make_runner()
+    runner.learn(1)
+    runner.save(str(tmp_path / "model_0.pt"))
+    broken = load_checkpoint(tmp_path / "model_0.pt")
+    optimizer = broken["optimizer_state_dict"]
+    if part == "lr":
+        optimizer["param_groups"][0]["lr"] = value
+    elif part == "moment":
+        optimizer["state"][0]["exp_avg"].view(-1)[0] = value
+    else:
+        name = next(iter(broken[part]))
+        broken[part][name].view(-1)[0] = value
+    save_checkpoint(broken, tmp_path / "model_1.pt")
+    before = {key: value.clone() for key, value in runner.alg.get_policy().state_dict().items()}
+    with pytest.raises(CheckpointError, match=r"model_1.pt.*NaN or infinite"):
+        runner.load(str(tmp_path / "model_1.pt"))
+    after = runner.alg.get_policy().state_dict()
+    assert all(torch.equal(before[key], after[key]) for key in before)
+
+
+@pytest.mark.parametrize("garbage", [7, {}, None, {"a": torch.zeros(2)}])
+@pytest.mark.parametrize(
+    "part", ["version", "num_envs", "rng", "observations", "logger", "hidden_states"]
+)
+def test_a_malformed_training_state_is_one_clear_error(
+    make_runner, tmp_path: Path, caplog, part, garbage
+):
+    runner = make_runner(tmp_path / "run")
+    runner.learn(1)
+    checkpoint = load_checkpoint(tmp_path / "run" / "model_0.pt")
+    checkpoint["training_state"][part] = garbage
+    save_checkpoint(checkpoint, tmp_path / "model_0.pt")
+    other = make_runner()
+    other.load(str(tmp_path / "model_0.pt"))
+    told = ""
+    try:
+        other.learn(2)
+    except CheckpointError as error:
+        told = str(error)
+    assert "training_state" in told or "does not fit" in caplog.text
+
+
 @pytest.mark.parametrize("content", [b"hello, world", b"PK\x03\x04 no zip", b"\x80\x04."])
 def test_a_file_that_is_no_checkpoint_is_called_so(tmp_path: Path, content):
     path = tmp_path / "model_0.pt"

@@ -162,7 +162,7 @@ def test_a_finished_run_has_nothing_left_to_train(make_runner, tmp_path: Path, c
     assert not list((tmp_path / "second").glob("model_*"))
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_training_with_a_checkpoint_that_resumes(make_runner, tmp_path: Path, number):
     straight = make_runner(tmp_path / "straight")
     straight.learn(5)
@@ -201,6 +201,111 @@ def test_a_second_signal_is_not_held_back(make_runner, tmp_path: Path):
     with pytest.raises(KeyboardInterrupt):
         runner.learn(5)
     assert runner.stop_reason == "failed"
+
+
+def test_two_hangups_of_a_closed_terminal_save(make_runner, tmp_path: Path):
+    class HangUp(TrainingObserver):
+        def on_iteration(self, stats):
+            os.kill(os.getpid(), signal.SIGHUP)
+            os.kill(os.getpid(), signal.SIGHUP)
+
+    runner = make_runner(tmp_path / "run")
+    runner.observers.append(HangUp())
+    runner.learn(5)
+    assert runner.stop_reason == "interrupted"
+    assert (tmp_path / "run" / "model_0.pt").exists()
+
+
+def test_a_process_that_ignores_hangups_trains_on(make_runner, tmp_path: Path):
+    class HangUp(TrainingObserver):
+        def on_iteration(self, stats):
+            os.kill(os.getpid(), signal.SIGHUP)
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        runner = make_runner(tmp_path / "run")
+        runner.observers.append(HangUp())
+        runner.learn(3)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert runner.stop_reason == "finished"
+
+
+@pytest.mark.parametrize("place", ["term", "update"])
+def test_an_error_leaves_what_was_learned_before_it(
+    make_runner, tmp_path: Path, monkeypatch, caplog, place
+):
+    straight = make_runner(tmp_path / "straight", save_interval=100)
+    straight.learn(3)
+    runner = make_runner(tmp_path / "run", save_interval=100)
+    update, step = runner.alg.update, runner.env.step
+
+    def broken_update():
+        losses = update()
+        if runner.current_learning_iteration == 3:
+            raise ZeroDivisionError("in a network")
+        return losses
+
+    def broken_step(actions):
+        if runner.current_learning_iteration == 3:
+            raise ZeroDivisionError("in a term")
+        return step(actions)
+
+    if place == "update":
+        monkeypatch.setattr(runner.alg, "update", broken_update)
+    else:
+        monkeypatch.setattr(runner.env, "step", broken_step)
+    with pytest.raises(ZeroDivisionError, match="in a"):
+        runner.learn(6)
+    assert "iteration 4" in caplog.text
+    assert "new episodes" in caplog.text
+    resumed = make_runner(tmp_path / "resumed")
+    resumed.load(str(tmp_path / "run" / "model_2.pt"))
+    assert resumed.current_learning_iteration == 3
+    for name in ("actor", "critic"):
+        saved = getattr(resumed.alg, name).state_dict()
+        assert_same_bits(saved, getattr(straight.alg, name).state_dict())
+    states = [learner.alg.optimizer.state_dict()["state"] for learner in (resumed, straight)]
+    assert_same_bits(states[0][0], states[1][0])
+    resumed.learn(4)
+
+
+def test_an_error_does_not_replace_a_checkpoint_that_resumes_exactly(
+    make_runner, tmp_path: Path, monkeypatch
+):
+    runner = make_runner(tmp_path / "run")
+    runner.learn(1)
+    whole = (tmp_path / "run" / "model_0.pt").read_bytes()
+    monkeypatch.setattr(runner.alg, "update", lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        runner.learn(3)
+    assert (tmp_path / "run" / "model_0.pt").read_bytes() == whole
+
+
+def test_a_run_whose_folder_is_gone_is_saved_beside_it(make_runner, tmp_path: Path):
+    straight = make_runner(tmp_path / "straight")
+    straight.learn(4)
+    expected = everything(straight)
+    folder = tmp_path / "run"
+
+    class Move(TrainingObserver):
+        def on_iteration(self, stats):
+            if stats.iteration == 2:
+                folder.rename(tmp_path / "moved")
+
+    runner = make_runner(folder)
+    runner.observers.append(Move())
+    with pytest.raises(RunFolderError) as caught:
+        runner.learn(4)
+    rescued = tmp_path / "run_rescued" / "model_1.pt"
+    assert str(folder) in str(caught.value)
+    assert str(rescued) in str(caught.value)
+    assert not folder.exists()
+    resumed = make_runner(tmp_path / "resumed")
+    resumed.load(str(rescued))
+    resumed.learn(4)
+    assert_same_bits(everything(resumed), expected)
 
 
 def solved_at(value: float, **changes) -> dict:

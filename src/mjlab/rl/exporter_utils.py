@@ -11,6 +11,7 @@ first, in its order and layout; numbers have full precision, and more keys follo
 | image_groups | the groups of images, each an input of its own; left out where there are none |
 | observation_dims | size of each of its terms, history included |
 | observation_delay | lowest and highest lag of each term, in steps |
+| initializers_sha256 | digest of the weights in the file, see `initializers_digest` |
 | step_dt, physics_dt, decimation | control period (s), physics time step (s), their ratio |
 
 A term's target is `action * action_scale + action_offset`, clipped to `action_clip`. Commands that a
@@ -28,6 +29,7 @@ The policy observes (A sin(2 pi c), A cos(2 pi c)).
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import tempfile
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
 Metadata = dict[str, list | str | float]
+DIGEST_KEY = "initializers_sha256"
 
 logger = logging.getLogger(__name__)
 
@@ -90,6 +93,22 @@ def attach_metadata_to_onnx(onnx_path: str, metadata: Mapping[str, list | str | 
     for key, value in {**kept, **metadata_texts(metadata)}.items():
         model.metadata_props.add(key=key, value=value)
     write_atomically(Path(onnx_path), model.SerializeToString())
+
+
+def initializers_digest(path: str | Path) -> str:
+    """Return the SHA-256 (hexadecimal) over the initializers of an ONNX file: the policy's weights.
+
+    Over each, in order of their names: name, NumPy type and shape, a line each, and the values.
+    """
+    import onnx
+
+    digest = hashlib.sha256()
+    initializers = onnx.load(str(path)).graph.initializer
+    for tensor in sorted(initializers, key=lambda tensor: tensor.name):
+        values = onnx.numpy_helper.to_array(tensor)
+        digest.update(f"{tensor.name}\n{values.dtype}\n{values.shape}\n".encode())
+        digest.update(values.tobytes())
+    return digest.hexdigest()
 
 
 def metadata_texts(metadata: Mapping[str, list | str | float]) -> dict[str, str]:

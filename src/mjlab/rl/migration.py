@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -21,6 +22,8 @@ _DICT_ENTRIES = (
     "teacher_state_dict", "optimizer_state_dict", "rnd_state_dict", "rnd_optimizer_state_dict",
     "infos", "training_state",
 )  # fmt: skip
+# Entries in which nothing is ever infinite.
+_LEARNING_ENTRIES = ("optimizer_state_dict", "rnd_optimizer_state_dict", "sac_state_dict")
 _COUNT_ENTRIES = {"iter": -1, "iterations_finished": 0, "last_evaluated": 0}
 
 
@@ -105,15 +108,24 @@ def check_fits(
     """Check that the state dict `saved` fits `model`.
 
     Raises:
-        CheckpointError: parameters are missing, unknown, or of another shape; all are listed.
+        CheckpointError: parameters are missing, unknown, of another shape, or NaN or infinite; all are
+            listed.
     """
     if saved is None:
         raise CheckpointError(
             f"The checkpoint {path!r} holds no {name} weights; use one that the same learner wrote."
         )
-    expected = {key: tuple(value.shape) for key, value in model.state_dict().items()}
+    own = model.state_dict()
+    expected = {key: tuple(value.shape) for key, value in own.items()}
     found = {key: tuple(value.shape) for key, value in saved.items() if hasattr(value, "shape")}
     if expected == found:
+        # What a network is built with, such as a mask of minus infinity, may be in its checkpoint.
+        broken = [key for key in own if not _is_finite(saved[key]) and _is_finite(own[key])]
+        if broken:
+            raise CheckpointError(
+                f"The checkpoint {path!r} holds {name} weights that are NaN or infinite: "
+                f"{', '.join(broken)}. Use an earlier one; nothing was changed."
+            )
         return
     lines = [
         f"  {key}: expected {expected.get(key, 'nothing')}, found {found.get(key, 'nothing')}"
@@ -125,6 +137,10 @@ def check_fits(
         f"{name} config.\n" + "\n".join(lines) + "\nUse a checkpoint of this task, or make "
         f"the network (--agent.{name}.) and the observations what they were when it was trained."
     )
+
+
+def _is_finite(value: torch.Tensor) -> bool:
+    return bool(torch.isfinite(value).all())
 
 
 def check_optimizer_fits(
@@ -146,6 +162,36 @@ def check_optimizer_fits(
             f"The checkpoint {path!r} holds no optimizer state for these networks. To use its "
             "policy only, load it with load_cfg={'actor': True}; nothing was changed."
         )
+
+
+def check_finite(checkpoint: Mapping[str, Any], path: str) -> None:
+    """Check the states of optimizers and of SAC, learning rates among them.
+
+    Raises:
+        CheckpointError: something is NaN or infinite.
+    """
+    for name in _LEARNING_ENTRIES:
+        broken = _not_finite(checkpoint.get(name), name)
+        if broken:
+            raise CheckpointError(
+                f"The checkpoint {path!r} holds values that are NaN or infinite: {', '.join(broken)}. "
+                "Use an earlier one; nothing was changed."
+            )
+
+
+def _not_finite(value: Any, name: str) -> list[str]:
+    """Return the names of tensors and numbers within `value` that are NaN or infinite."""
+    if isinstance(value, torch.Tensor):
+        return [] if _is_finite(value) else [name]
+    if isinstance(value, float):
+        return [] if math.isfinite(value) else [name]
+    if isinstance(value, dict):
+        items = value.items()
+    elif isinstance(value, (list, tuple)):
+        items = enumerate(value)
+    else:
+        return []
+    return [found for key, item in items for found in _not_finite(item, f"{name}.{key}")]
 
 
 def _optimizer_fits(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> bool:

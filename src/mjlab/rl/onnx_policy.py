@@ -10,6 +10,7 @@ of use on a robot, and which an environment has itself.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +20,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.rl.checkpoint import CheckpointError
-from mjlab.rl.exporter_utils import get_base_metadata, metadata_texts
+from mjlab.rl.exporter_utils import (
+    DIGEST_KEY,
+    get_base_metadata,
+    initializers_digest,
+    metadata_texts,
+)
 from mjlab.rl.onnx_operators import (
     OPERATORS,
     ROW_WISE,
@@ -31,6 +37,8 @@ from mjlab.rl.onnx_operators import (
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
+
+logger = logging.getLogger(__name__)
 
 # What has to be the same where a policy was trained and where it is played. Numbers are compared
 # with a tolerance, because mjlab 1.6 writes three decimals.
@@ -102,6 +110,7 @@ class OnnxPolicy(torch.nn.Module):
         self.path = Path(path)
         model = _load(self.path)
         self.metadata: dict[str, str] = {item.key: item.value for item in model.metadata_props}
+        self._compare_digests()
         self._constants = torch.nn.ParameterDict()
         self._names: dict[str, str] = {}
         # Sizes and axes, which stay on the CPU, where they are looked at.
@@ -161,6 +170,15 @@ class OnnxPolicy(torch.nn.Module):
         for name, value in self._remembered.items():
             ended = (dones != 0).view(-1, *(1 for _ in value.shape[1:]))
             self._remembered[name] = torch.where(ended, 0.0, value)
+
+    def _compare_digests(self) -> None:
+        # Not refused, because people optimize graphs.
+        written = self.metadata.get(DIGEST_KEY)
+        if written is not None and written != initializers_digest(self.path):
+            logger.warning(
+                "The weights in %s are not those that were exported (%s differs): the file was edited "
+                "or damaged.", self.path, DIGEST_KEY,
+            )  # fmt: skip
 
     def _memory(self, inputs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """Return what is remembered in each environment, (N, *shape) by name; zeros at first."""

@@ -72,7 +72,7 @@ class TrainingObserver:
         """A checkpoint was written."""
 
     def on_stop_requested(self, signal_name: str) -> None:
-        """SIGINT or SIGTERM arrived; the running iteration is being finished."""
+        """SIGINT, SIGTERM or SIGHUP arrived; the running iteration is being finished."""
 
     def on_end(self, reason: str) -> None:
         """Training ended: `finished`, `solved`, `interrupted` or `failed`."""

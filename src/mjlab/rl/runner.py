@@ -17,6 +17,7 @@ import torch
 from mjlab.rl import training_state
 from mjlab.rl.checkpoint import (
     CheckpointError,
+    RunFolderError,
     ensure_writable_folder,
     load_checkpoint,
     save_checkpoint,
@@ -25,13 +26,18 @@ from mjlab.rl.distributed import join_processes
 from mjlab.rl.divergence import RolloutWatch
 from mjlab.rl.evaluate import reward_unit
 from mjlab.rl.evaluation_result import EvaluationResult
-from mjlab.rl.exporter_utils import attach_metadata_to_onnx, get_base_metadata
+from mjlab.rl.exporter_utils import (
+    DIGEST_KEY,
+    attach_metadata_to_onnx,
+    get_base_metadata,
+    initializers_digest,
+)
 from mjlab.rl.image_encoders import (
     settle_image_settings,
     shared_parameters_allowed,
     train_once,
 )
-from mjlab.rl.migration import check_fits, check_optimizer_fits, migrate
+from mjlab.rl.migration import check_finite, check_fits, check_optimizer_fits, migrate
 from mjlab.rl.network_checks import check_networks
 from mjlab.rl.onnx_export import export_to_onnx
 from mjlab.rl.progress import IterationStats, TrainingObserver
@@ -121,6 +127,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self.last_evaluation: EvaluationResult | None = None
         self._observations: TensorDict | None = None
         self._state_to_resume: dict[str, Any] | None = None
+        # What the algorithm saves after the last finished iteration.
+        self._learned: dict[str, Any] | None = None
         # An evaluation is due after the last iteration, and was left out to stop sooner.
         self._owes_evaluation = False
         self._solved_check = SolvedCheck(
@@ -137,9 +145,10 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train until `num_learning_iterations` iterations are finished IN TOTAL.
 
-        Iterations before a `load` count. SIGINT and SIGTERM end training after the running
-        iteration; a second one ends the process. In every case a checkpoint that resumes exactly
-        is written, and the policy exported.
+        Iterations before a `load` count. SIGINT, SIGTERM and SIGHUP end training after the running
+        iteration; a second one ends the process. Then as at the end a checkpoint that resumes exactly
+        is written, and the policy exported. After an error, weights and optimizer of the last finished
+        iteration are in a checkpoint, which resumes in new episodes.
 
         Args:
             num_learning_iterations: Total number of iterations.
@@ -147,9 +156,11 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 they do not all reset together. Has no effect where episodes are resumed.
 
         Raises:
-            RunFolderError: the run folder cannot be written to; raised before any training.
+            RunFolderError: the run folder cannot be written to, raised before any training; or it is
+                gone, and the run was saved beside it.
             CheckpointError: a checkpoint could not be written.
-            DivergedError: training failed because the physics of a joint diverged.
+            DivergedError: the physics diverged in most environments, or training failed because of it.
+            BrokenTermError: a reward or a termination stayed NaN in every environment.
             ValueError: the environment returned NaN, Weights & Biases started no run, or a student has
                 no teacher.
         """
@@ -170,7 +181,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             ):
                 observations = self._start(init_at_random_ep_len)
                 self._tell("on_start", first, num_learning_iterations)
-                reason = self._iterate(observations, num_learning_iterations, stop)
+                with self._saving_after_errors():
+                    reason = self._iterate(observations, num_learning_iterations, stop)
                 self._finish(first, num_learning_iterations, reason)
                 self.stop_reason = reason or "finished"
         finally:
@@ -209,6 +221,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 return reason
         for iteration in range(first, total):
             begin = time.perf_counter()
+            self._learned = copy.deepcopy(self.alg.save())
             with self._watch.explaining(self.alg.get_policy()):
                 with torch.inference_mode():
                     with using_torch_threads(self._num_collecting_threads):
@@ -223,6 +236,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             stats = self._report(
                 iteration, first, total, collected - begin, learned - collected, losses
             )
+            self._check_run_folder()
             reason = self._reason_to_stop(stop, stats)
             if reason:
                 return reason
@@ -408,18 +422,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         observations = self._observations
         if observations is None:
             observations = self.env.get_observations()
-        done = self.current_learning_iteration
-        counter = getattr(self.env.unwrapped, "common_step_counter", 0)
-        checkpoint = self.alg.save()
-        # rsl_rl calls the last finished iteration "iter"; it cannot tell none from one.
-        checkpoint["iter"] = max(done - 1, 0)
-        checkpoint["iterations_finished"] = done
-        checkpoint["infos"] = {
-            **(infos or {}),
-            "env_state": {"common_step_counter": int(counter)},
-        }
-        checkpoint["last_evaluated"] = self._solved_check.last_iteration
-        checkpoint["owes_evaluation"] = self._owes_evaluation
+        checkpoint = {**self.alg.save(), **self._progress(infos)}
         checkpoint["training_state"] = training_state.capture(
             self.env, self.alg, self.logger, observations
         )
@@ -431,7 +434,20 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if replay is not None:
             ReplayFiles(path).remove_others()
         if self.cfg.get("upload_model", True):
-            self.logger.save_model(path, max(done - 1, 0))
+            self.logger.save_model(path, max(self.current_learning_iteration - 1, 0))
+
+    def _progress(self, infos: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Return the entries of a checkpoint that say how far the run has got."""
+        done = self.current_learning_iteration
+        counter = getattr(self.env.unwrapped, "common_step_counter", 0)
+        return {
+            # rsl_rl calls the last finished iteration "iter"; it cannot tell none from one.
+            "iter": max(done - 1, 0),
+            "iterations_finished": done,
+            "infos": {**(infos or {}), "env_state": {"common_step_counter": int(counter)}},
+            "last_evaluated": self._solved_check.last_iteration,
+            "owes_evaluation": self._owes_evaluation,
+        }
 
     def load(
         self,
@@ -498,6 +514,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if load_cfg is None or load_cfg.get("optimizer"):
             saved = checkpoint.get("optimizer_state_dict")
             check_optimizer_fits(self.alg.optimizer, saved, path=path)
+            check_finite(checkpoint, path)
 
     def _load_algorithm(
         self, checkpoint: dict[str, Any], load_cfg: dict | None, strict: bool, path: str
@@ -549,12 +566,54 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         """Write a checkpoint into the run folder, and the policy as ONNX beside it."""
         if not self._writes or self.logger.log_dir is None:
             return
-        name = f"model_{self.current_learning_iteration - 1}.pt"
-        path = os.path.join(self.logger.log_dir, name)
+        path = self._checkpoint_path(self.logger.log_dir)
         self.save(path)
         if not self.exports_on_save:
             self.export_policy(str(self._get_export_paths(path)[2]))
         self._tell("on_checkpoint", path)
+
+    def _checkpoint_path(self, folder: str) -> str:
+        return os.path.join(folder, f"model_{self.current_learning_iteration - 1}.pt")
+
+    def _check_run_folder(self) -> None:
+        """Save the run beside its folder, and raise RunFolderError, if that is gone."""
+        folder = self.logger.log_dir
+        if not self._writes or folder is None or os.path.isdir(folder):
+            return
+        path = self._checkpoint_path(f"{folder}_rescued")
+        self.save(path)
+        raise RunFolderError(
+            f"The run folder {folder!r} is no longer there: it was deleted or moved while the run was "
+            f"training. The run was saved to {path!r}, from which it resumes."
+        )
+
+    @contextlib.contextmanager
+    def _saving_after_errors(self) -> Generator[None]:
+        """After an error in the block, save what the last finished iteration had learned."""
+        try:
+            yield
+        except (CheckpointError, RunFolderError):
+            raise
+        except Exception:
+            folder = self.logger.log_dir
+            learned, done = self._learned, self.current_learning_iteration
+            if learned is not None and done > 0 and self._writes and folder is not None:
+                path = self._checkpoint_path(folder)
+                if not os.path.exists(path):
+                    self._save_learned(learned, path)
+            raise
+
+    def _save_learned(self, learned: dict[str, Any], path: str) -> None:
+        try:
+            save_checkpoint({**learned, **self._progress()}, path)
+        except CheckpointError as error:
+            # What failed first is what the user has to know.
+            logger.warning("%s", error)
+            return
+        logger.warning(
+            "Training failed in iteration %d. Weights and optimizer of before are in %s; a run that is "
+            "resumed from there starts in new episodes.", self.current_learning_iteration + 1, path,
+        )  # fmt: skip
 
     # Export.
 
@@ -592,7 +651,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             logger.warning("The policy was not exported to %s: %s", path, error)
             return None
         try:
-            attach_metadata_to_onnx(path, self.onnx_metadata())
+            digest = {DIGEST_KEY: initializers_digest(path)}
+            attach_metadata_to_onnx(path, {**self.onnx_metadata(), **digest})
         except Exception as error:
             logger.warning("The exported policy %s is without metadata: %s", path, error)
         if self.cfg.get("upload_model", True):

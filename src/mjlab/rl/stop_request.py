@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM ask training to stop after the running iteration; a second one kills."""
+"""SIGINT (Ctrl-C), SIGTERM and SIGHUP ask training to stop after the running iteration."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# Not on every system: SIGHUP, which a closed terminal sends.
+_HANGUP = getattr(signal, "SIGHUP", None)
 
 
 class StopRequest:
-    """A context in which SIGINT and SIGTERM set `signal_name` instead of ending the process.
+    """A context in which these signals set `signal_name` instead of ending the process.
 
     The handlers that were there before come back with the first signal, so that a second one does
-    what it always did, and at the end of the context. Outside the main thread, which alone can
-    handle signals, nothing is changed.
+    what it always did, and at the end of the context. A second SIGHUP is ignored until then, because
+    a terminal and its shell both send one. A process that ignores SIGHUP, such as one under `nohup`,
+    goes on doing so. Outside the main thread, which alone can handle signals, nothing is changed.
     """
 
     def __init__(self, on_request: Callable[[str], None] | None = None) -> None:
@@ -32,7 +34,10 @@ class StopRequest:
 
     def __enter__(self) -> StopRequest:
         if threading.current_thread() is threading.main_thread():
-            for number in _SIGNALS:
+            numbers = [signal.SIGINT, signal.SIGTERM]
+            if _HANGUP is not None and signal.getsignal(_HANGUP) is not signal.SIG_IGN:
+                numbers.append(_HANGUP)
+            for number in numbers:
                 self._previous[number] = signal.signal(number, self._handle)
         return self
 
@@ -41,12 +46,14 @@ class StopRequest:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.signal_name = signal.Signals(number).name
-        self._restore_handlers()
+        self._restore_handlers(without=_HANGUP)
+        if _HANGUP in self._previous:
+            signal.signal(_HANGUP, signal.SIG_IGN)
         if self._on_request is not None:
             self._on_request(self.signal_name)
 
-    def _restore_handlers(self) -> None:
-        while self._previous:
-            number, handler = self._previous.popitem()
+    def _restore_handlers(self, without: int | None = None) -> None:
+        for number in [number for number in self._previous if number != without]:
+            handler = self._previous.pop(number)
             # A handler that was not set from Python reads as None and cannot be set again.
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.rl.checkpoint import CheckpointError
 from mjlab.rl.rsl import TensorDict
 from mjlab.utils.random import rng_state, set_rng_state
 
@@ -45,13 +46,32 @@ def restore(
 
     Raises:
         ValueError: the state is of other environments; nothing was changed then.
+        CheckpointError: the state is malformed.
     """
+    try:
+        return _restore(state, env, algorithm, run_logger)
+    except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
+        raise CheckpointError(
+            f"The checkpoint's training_state is malformed ({type(error).__name__}: {error}). Use an "
+            "earlier checkpoint, or load only its networks with load_cfg={'actor': True, 'critic': True}."
+        ) from error
+
+
+def _restore(
+    state: dict[str, Any], env: VecEnv, algorithm: Any, run_logger: RunLogger
+) -> TensorDict:
     if state.get("version") != VERSION:
         raise ValueError(f"It was saved in format {state.get('version')}, not {VERSION}.")
     if state["num_envs"] != env.num_envs:
         raise ValueError(
             f"It is of {state['num_envs']} environments and this run has {env.num_envs}; give "
             f"--num-envs {state['num_envs']}."
+        )
+    observations = _unflat(state["observations"], env.num_envs)
+    expected = env.get_observations()
+    if _shapes(observations) != _shapes(expected):
+        raise ValueError(
+            f"Its observations are {_shapes(observations)}, and this run's {_shapes(expected)}."
         )
     unwrapped: Any = getattr(env, "unwrapped", env)
     if "env" in state and hasattr(unwrapped, "load_state_dict"):
@@ -61,13 +81,15 @@ def restore(
     device = run_logger.device
     run_logger.load_state_dict(state["logger"])
     for model, hidden in zip(_models(algorithm), state["hidden_states"], strict=True):
+        if (hidden is not None) != bool(getattr(model, "is_recurrent", False)):
+            raise TypeError("hidden_states are not those of these networks")
         if hidden is not None:
             model.reset(hidden_state=_as_tuples(_to(hidden, device)))
     if hasattr(algorithm, "last_hidden_states"):
         # Of rsl_rl's distillation, which begins an update with those before the iteration.
         algorithm.last_hidden_states = (algorithm.student.get_hidden_state(), None)
     _restore_rnd(getattr(algorithm, "rnd", None), state["rnd"], device)
-    observations = _unflat(state["observations"], env.num_envs).to(device)
+    observations = observations.to(device)
     # Last, because restoring may have drawn random numbers.
     set_rng_state(state["rng"])
     return observations
@@ -112,6 +134,10 @@ def _flat(observations: TensorDict) -> dict[str, torch.Tensor]:
         "\n".join(key) if isinstance(key, tuple) else key: observations.get(key)
         for key in observations.keys(include_nested=True, leaves_only=True)
     }
+
+
+def _shapes(observations: TensorDict) -> dict[str, tuple[int, ...]]:
+    return {key: tuple(value.shape) for key, value in _flat(observations).items()}
 
 
 def _unflat(tensors: dict[str, torch.Tensor], num_envs: int) -> TensorDict:

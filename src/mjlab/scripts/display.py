@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import stat
 import sys
 import time
 from typing import TYPE_CHECKING
@@ -86,6 +88,8 @@ class TrainingDisplay(TrainingObserver):
 
     def on_stop_requested(self, signal_name: str) -> None:
         """Tell that a signal arrived and what happens now."""
+        if signal_name == "SIGHUP":
+            _let_go_of_the_terminal()
         self._console.print(
             f"{signal_name}: finishing this iteration, then saving. Once more to stop at once.",
             highlight=False,
@@ -109,6 +113,18 @@ class TrainingDisplay(TrainingObserver):
         for first, second in zip(cells[::2], cells[1::2], strict=True):
             table.add_row(first[0], first[1], second[0], second[1])
         return Panel(Group(self._progress, table), title=self._title, title_align="left")
+
+
+def _let_go_of_the_terminal() -> None:
+    """Send standard output and error nowhere if they go to a terminal, which was closed.
+
+    Otherwise the next line would raise, before there is a checkpoint.
+    """
+    with open(os.devnull, "wb") as nowhere:
+        for number in (1, 2):
+            # A terminal that was closed is none to `isatty`, but still a character device.
+            if stat.S_ISCHR(os.fstat(number).st_mode):
+                os.dup2(nowhere.fileno(), number)
 
 
 def _cells(stats: IterationStats) -> list[tuple[str, str]]:
