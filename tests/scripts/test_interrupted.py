@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
+import pytest
 import torch
 from commands import SMALL, TASK
 
@@ -18,13 +21,20 @@ from mjlab.scripts.run_folder import checkpoints_in, read_run_info
 PATIENCE = 60.0
 
 
-def start_endless_run(log_root: Path) -> subprocess.Popen[str]:
+def endless_run(log_root: Path) -> list[str]:
     command = [sys.executable, "-m", "mjlab.scripts.train", TASK, *SMALL]
-    command += ["--log-root", str(log_root), "--agent.max-iterations", "1000000"]
+    return [*command, "--log-root", str(log_root), "--agent.max-iterations", "1000000"]
+
+
+def start_endless_run(log_root: Path) -> subprocess.Popen[str]:
     # One thread, as in the runs that these are compared with.
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
+        endless_run(log_root),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=environment,
     )
 
 
@@ -76,3 +86,32 @@ def test_sigterm_saves_exports_and_ends_with_status_0(train, tmp_path):
     assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"
     assert list(run_dir.glob("*.onnx"))
     assert_resumes_exactly(train, log_root, run_dir, tmp_path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
+def test_a_terminal_that_is_closed_leaves_a_checkpoint(tmp_path):
+    import pty
+
+    log_root = tmp_path / "logs"
+    child, terminal = pty.fork()
+    if child == 0:
+        os.execv(sys.executable, endless_run(log_root))
+    # What is not read from a terminal stops the one who writes.
+    reader = threading.Thread(target=read_until_closed, args=(terminal,), daemon=True)
+    reader.start()
+    end = time.monotonic() + PATIENCE
+    while not list(log_root.glob("cartpole/*/model_0.pt")) and time.monotonic() < end:
+        time.sleep(0.01)
+    os.kill(child, signal.SIGHUP)
+    os.close(terminal)
+    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    (run_dir,) = (log_root / "cartpole").iterdir()
+    info = read_run_info(run_dir)
+    assert (status, info["ended"]) == (0, "interrupted")
+    assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"
+
+
+def read_until_closed(terminal: int) -> None:
+    with contextlib.suppress(OSError):
+        while os.read(terminal, 4096):
+            pass

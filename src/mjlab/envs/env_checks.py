@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from mjlab.envs.mdp.terminations import time_out
+from mjlab.managers.real_values import check_real
 
 if TYPE_CHECKING:
     from mjlab.envs.env_cfg import ManagerBasedRlEnvCfg
@@ -75,8 +76,10 @@ def as_action(action: Any, device: str) -> torch.Tensor:
 
     Raises:
         ValueError: it is neither a tensor nor an array of numbers.
+        TypeError: it is a tensor of complex numbers, or without data.
     """
     if isinstance(action, torch.Tensor):
+        check_real("The action", action)
         return action.to(device)
     try:
         # Copied, because torch warns about arrays that it may not write to.

@@ -22,6 +22,7 @@ from mjlab.managers.build_checks import check_term
 from mjlab.managers.config_edits import changes, plain_values, write_changes
 from mjlab.managers.env_ids import EnvIds, as_index
 from mjlab.managers.error_labels import errors_named
+from mjlab.managers.real_values import check_real
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.table import format_table
 from mjlab.utils.state import stateful
@@ -262,6 +263,7 @@ class ManagerBase(ABC):
                 f"{tuple(self._value_shape)}: one value for each environment. Reduce the other "
                 "dimensions (sum, mean, squeeze) in the term."
             )
+        check_real(self._label(name), value)
 
     def _unknown(self, name: str, known: Sequence[str], error: type[Exception]) -> NoReturn:
         raise error(f"{type(self).__name__} has no term {name!r}. Its terms: {list(known)}.")

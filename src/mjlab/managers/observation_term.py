@@ -11,6 +11,7 @@ from mjlab.managers.error_labels import errors_named
 from mjlab.managers.manager_base import ManagerTermBaseCfg
 from mjlab.managers.nan_policy import NanPolicy, apply_nan_policy
 from mjlab.managers.observation_checks import check_clip, scale_tensor
+from mjlab.managers.real_values import check_real
 from mjlab.utils.buffers import CircularBuffer, DelayBuffer
 from mjlab.utils.noise import NoiseCfg, NoiseModelCfg
 from mjlab.utils.state import stateful
@@ -154,6 +155,8 @@ class ObservationTerm:
                 f"Observation term {self.label!r} returned shape {tuple(value.shape)}, but "
                 f"{tuple(self._raw_shape)} when the environment was built. Shapes must not change."
             )
+        else:
+            check_real(f"Observation term {self.label!r}", value)
         # Policies are float32, whatever the default type with which a term makes its tensors.
         return value.float() if value.dtype == torch.float64 else value
 
@@ -170,6 +173,7 @@ class ObservationTerm:
                 f"Observation term {self.label!r} returned shape {tuple(value.shape)}, expected "
                 f"{expected}.{hint}"
             )
+        check_real(f"Observation term {self.label!r}", value)
 
     def _with_noise(self, value: torch.Tensor, noise: NoiseCfg | NoiseModelCfg) -> torch.Tensor:
         if isinstance(noise, NoiseModelCfg):
