@@ -340,7 +340,7 @@ class ManagerBasedRlEnv:
         if not self._holds_common_steps:
             self.common_step_counter += 1
 
-        self.diverged = self.sim.bad_states()
+        self.diverged.copy_(self.sim.bad_states())
         for manager in (self.termination_manager, self.reward_manager):
             manager.nonfinite.begin_step(self.diverged, self.common_step_counter)
         self.reset_buf = self.termination_manager.compute()
