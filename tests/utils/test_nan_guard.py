@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -183,6 +184,27 @@ def test_a_dump_replaces_the_links_of_an_earlier_one(
     guard = make_guard(model, tmp_path)
     run_until_nan(guard, data, [0])
     assert (tmp_path / "nan_dump_latest.npz").resolve() == guard.dump_path
+
+
+def test_a_dump_goes_elsewhere_if_another_user_planted_its_folder(
+    model: mujoco.MjModel,
+    data: SimpleNamespace,
+    tmp_path: Path,
+    plant: Callable[[Path, Path], None],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    victim, shared = tmp_path / "victim", tmp_path / "shared"
+    victim.mkdir()
+    shared.mkdir()
+    shared.chmod(0o1777)
+    plant(shared / "mjlab", victim)
+    guard = make_guard(model, shared / "mjlab" / "nan_dumps")
+    run_until_nan(guard, data, [0])
+    assert not list(victim.iterdir())
+    assert guard.dump_path is not None
+    assert guard.dump_path.parent == tmp_path / "cache" / "mjlab" / "nan_dumps"
+    assert NanDump.load(guard.dump_path).steps == [0, 1, 2, 3]
 
 
 def test_asking_for_a_substep_that_is_not_in_the_dump_says_what_is(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import shutil
 import tempfile
 from collections import deque
 from collections.abc import Callable, Generator, Mapping
@@ -14,6 +13,8 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from mjlab.utils.os import own_folder, replacing
 
 if TYPE_CHECKING:
     import mujoco
@@ -43,7 +44,8 @@ class NanGuardCfg:
     output_dir: str = field(
         default_factory=lambda: str(Path(tempfile.gettempdir()) / "mjlab" / "nan_dumps")
     )
-    """Folder into which the dump is written."""
+    """Folder into which the dump is written. If it is in a shared folder, such as `/tmp`, and another
+    user made it, the dump goes to `~/.cache/mjlab/` instead."""
     max_envs_to_dump: int = 5
     """Number of environments in a dump; the first that went NaN are taken."""
 
@@ -162,8 +164,7 @@ class NanGuard:
 
         ids = nan_ids[: self.cfg.max_envs_to_dump]
         stamp = datetime.now().strftime("%Y%m%d_%H%M%S")
-        folder = Path(self.cfg.output_dir)
-        folder.mkdir(parents=True, exist_ok=True)
+        folder = own_folder(Path(self.cfg.output_dir))
         path, model_path = (
             folder / f"nan_dump_{stamp}.npz",
             folder / f"model_{stamp}.mjb",
@@ -173,10 +174,12 @@ class NanGuard:
             for name, values in self.model_fields().items():
                 arrays[f"model_{name}"] = values[ids].cpu().numpy()
         arrays["_metadata"] = np.array(json.dumps(self._metadata(nan_ids, ids, stamp, model_path)))
-        mujoco.mj_saveModel(self.mj_model, str(model_path))
-        partial = path.with_suffix(".partial.npz")
-        np.savez_compressed(partial, **arrays)
-        partial.replace(path)
+        model = np.empty(mujoco.mj_sizeModel(self.mj_model), np.uint8)
+        mujoco.mj_saveModel(self.mj_model, None, model)
+        with replacing(model_path) as file:
+            file.write(model.tobytes())
+        with replacing(path) as file:
+            np.savez_compressed(file, **arrays)
         _link(folder / "nan_dump_latest.npz", path)
         _link(folder / "model_latest.mjb", model_path)
         return path
@@ -313,4 +316,5 @@ def _link(link: Path, target: Path) -> None:
     try:
         os.symlink(target.name, link)
     except OSError:
-        shutil.copyfile(target, link)
+        with replacing(link) as file:
+            file.write(target.read_bytes())

@@ -6,15 +6,20 @@ import contextlib
 import dataclasses
 import enum
 import functools
+import logging
 import os
 import re
+import secrets
+import stat
 import tempfile
 from collections.abc import Generator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from mjlab.compat import older_names
 from mjlab.utils.string import qualified_name
+
+logger = logging.getLogger(__name__)
 
 _WANDB_CACHE = "wandb_checkpoints"
 _WANDB_CHECKPOINT = re.compile(r"model_(\d+)\.pt")
@@ -45,8 +50,8 @@ def dump_yaml(filename: Path, data: dict[str, Any], sort_keys: bool = False) -> 
         sort_keys=sort_keys,
         default_flow_style=False,
     )
-    with _replacing(filename) as temporary:
-        temporary.write_text(text)
+    with replacing(filename) as file:
+        file.write(text.encode())
 
 
 def to_plain(value: Any, _parents: tuple[int, ...] = ()) -> Any:
@@ -187,14 +192,55 @@ def get_wandb_checkpoint_path(
 
 
 @contextlib.contextmanager
-def _replacing(path: Path) -> Generator[Path, None, None]:
-    """Yield a temporary path that takes the place of `path` if the block succeeds."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+def replacing(path: Path, *, flush: bool = False) -> Generator[IO[bytes]]:
+    """Yield a binary file that takes the place of `path` if the block succeeds.
+
+    It is written beside `path` and renamed, so `path` appears whole or not at all. The umask decides
+    who may read it, and a link at `path` is replaced instead of followed. `flush`: the content is on
+    the disk before the file gets its name.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    # "x" makes a new file: it fails if a file or a link has that name.
+    file = open(temporary, "xb")  # noqa: SIM115
     try:
-        yield temporary
+        with file:
+            yield file
+            if flush:
+                file.flush()
+                os.fsync(file.fileno())
         os.replace(temporary, path)
-    finally:
+    except BaseException:
         temporary.unlink(missing_ok=True)
+        raise
+
+
+def own_folder(folder: Path) -> Path:
+    """Make `folder` and return it, or a folder of that name in the user's cache if it is foreign.
+
+    Foreign is a folder that another user could have planted, or a link to one: in a folder that
+    everyone may write to, such as `/tmp`, a part of the path belongs to neither this user nor root.
+
+    Raises:
+        OSError: the folder cannot be made.
+    """
+    path = Path(os.path.abspath(folder))
+    for part in (*reversed(path.parents), path):
+        if not os.path.lexists(part):
+            with contextlib.suppress(FileExistsError):
+                part.mkdir()
+        if _is_foreign(part):
+            cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+            own = cache / "mjlab" / path.name
+            own.mkdir(parents=True, exist_ok=True)
+            logger.warning("%s belongs to another user; %s is used instead.", part, own)
+            return own
+    return folder
+
+
+def _is_foreign(path: Path) -> bool:
+    if not hasattr(os, "geteuid") or not path.parent.stat().st_mode & stat.S_IWOTH:
+        return False
+    return path.lstat().st_uid not in (os.geteuid(), 0)
 
 
 __getattr__ = older_names(__name__)
