@@ -40,7 +40,7 @@ class FakeRunner:
 def start(code: str):
     """Return what starts a process of Python code instead of the view."""
 
-    def start(exchange: Exchange, port: int) -> subprocess.Popen:
+    def start(exchange: Exchange, host: str, port: int) -> subprocess.Popen:
         with open(exchange.log, "wb") as log:
             command = [sys.executable, "-c", code, str(exchange.folder)]
             return subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log)

@@ -117,7 +117,7 @@ def test_what_cannot_be_shown_is_one_message(run, dump_file: Path, tmp_path: Pat
     assert "--enable-nan-guard" in missing.message
     (tmp_path / "text.npz").write_text("no dump")
     assert "is not a NaN dump" in run("viz_nan", str(tmp_path / "text.npz")).message
-    with pytest.raises(UserError, match="--port is 0"):
+    with pytest.raises(ValueError, match="--port is 0"):
         run_viz_nan(str(dump_file), VizNanConfig(port=0))
 
 

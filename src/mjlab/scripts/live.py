@@ -108,7 +108,9 @@ class LiveView(TrainingObserver):
         self._folder = tempfile.TemporaryDirectory(prefix="mjlab-live-")
         self._exchange = Exchange(Path(self._folder.name))
         self._next_weights = 0.0
-        self._process: subprocess.Popen | None = _start(self._exchange, cfg.live_port)
+        self._process: subprocess.Popen | None = _start(
+            self._exchange, cfg.live_host, cfg.live_port
+        )
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(len(job).to_bytes(8, "little") + job)
@@ -189,13 +191,16 @@ def _pickled(job: LiveJob) -> bytes:
         ) from error
 
 
-def _start(exchange: Exchange, port: int) -> subprocess.Popen:
+def _start(exchange: Exchange, host: str, port: int) -> subprocess.Popen:
     environment = {k: v for k, v in os.environ.items() if k not in _DISTRIBUTED}
     # The GPU is the training's, and so are all threads but one.
     environment |= {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1", "MJLAB_TORCH_THREADS": "1"}
     with open(exchange.log, "wb") as log:
         return subprocess.Popen(
-            [sys.executable, "-m", "mjlab.scripts.live_view", str(exchange.folder), str(port)],
+            [
+                *(sys.executable, "-m", "mjlab.scripts.live_view"),
+                *(str(exchange.folder), host, str(port)),
+            ],
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=log,

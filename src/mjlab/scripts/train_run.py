@@ -88,6 +88,8 @@ class TrainConfig:
     """Serve a page in the browser that shows the policy as it learns."""
     live_port: int = 8080
     """Port of that page; the next free one where it is taken."""
+    live_host: str = field(default="127.0.0.1", kw_only=True)
+    """Address that it is served on; 0.0.0.0 serves the whole network."""
     gpu_ids: list[int] | Literal["all"] | None = field(default_factory=lambda: [0])
     """Indices of the GPUs to use where --device is not given, or `all`; with several, a process
     for each is started. None trains on the CPU."""

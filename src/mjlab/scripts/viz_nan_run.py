@@ -9,6 +9,7 @@ import mujoco
 
 from mjlab.scripts.cli import UserError
 from mjlab.utils.nan_guard import NanDump
+from mjlab.viewer.page_server import check_address, page_url, serve_page
 
 
 @dataclass(frozen=True)
@@ -26,17 +27,15 @@ def run_viz_nan(path: str, cfg: VizNanConfig) -> None:
 
     Raises:
         UserError: the dump or its model is missing or cannot be read.
+        ValueError: the page cannot be served at that address.
     """
-    if not 1 <= cfg.port <= 65535:
-        raise UserError(f"--port is {cfg.port}; ports go from 1 to 65535.")
+    check_address(cfg.host, cfg.port, "--")
     dump, model = load_dump(path)
-    import viser
-
     from mjlab.scripts.nan_page import NanPage
 
-    server = viser.ViserServer(host=cfg.host, port=cfg.port, verbose=False)
+    server = serve_page(cfg.host, cfg.port)
     page = NanPage(server, dump, model)
-    print(f"Serving {path} on http://localhost:{server.get_port()} (Ctrl-C stops).", flush=True)
+    print(f"Serving {path} on {page_url(server)} (Ctrl-C stops).", flush=True)
     try:
         page.run()
     finally:
