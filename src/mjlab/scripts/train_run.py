@@ -34,7 +34,7 @@ from mjlab.scripts.run_folder import (
 from mjlab.scripts.task_options import options_of, prepare_env_cfg, with_task_options
 from mjlab.scripts.train_checks import check_flags
 from mjlab.scripts.training_device import training_device
-from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls, task_source
 from mjlab.utils.processes import ProcessRank, cores_per_process, process_rank
 
 if TYPE_CHECKING:
@@ -310,7 +310,10 @@ def _build_runner(
     # numbers the environment drew while it was built.
     seed_rng(cfg.agent.seed)
     further = options_of(task, cfg).runner_kwargs()
-    return runner_cls(env, asdict(cfg.agent), str(run_dir), device, **further)
+    runner = runner_cls(env, asdict(cfg.agent), str(run_dir), device, **further)
+    if (source := task_source(task)) is not None:
+        runner.add_git_repo_to_log(source)
+    return runner
 
 
 class _Beginning(TrainingObserver):
