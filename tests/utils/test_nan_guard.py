@@ -217,6 +217,17 @@ def test_asking_for_a_substep_that_is_not_in_the_dump_says_what_is(
         dump.apply(9, 0, model, mujoco.MjData(model))
 
 
+def test_a_dump_after_a_million_substeps_is_read_in_order(
+    model: mujoco.MjModel, data: SimpleNamespace, tmp_path: Path
+) -> None:
+    guard = make_guard(model, tmp_path)
+    guard._steps = 999_998
+    run_until_nan(guard, data, [0])
+    dump = NanDump.load(guard.dump_path or "")
+    assert dump.steps == [999_998, 999_999, 1_000_000, 1_000_001]
+    dump.apply(1_000_001, 0, model, mujoco.MjData(model))
+
+
 def test_a_file_that_is_no_dump_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.npz"
     np.savez(path, a=np.zeros(3))

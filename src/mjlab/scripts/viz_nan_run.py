@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import zipfile
+import copy
 from dataclasses import dataclass
 
 import mujoco
@@ -50,8 +50,8 @@ def load_dump(path: str) -> tuple[NanDump, mujoco.MjModel]:
     """
     try:
         dump = NanDump.load(path)
-    except zipfile.BadZipFile as error:
-        raise UserError(f"The dump {path} is damaged, or only in part here: {error}.") from error
+    except ValueError as error:
+        raise UserError(str(error)) from error
     except FileNotFoundError:
         raise UserError(
             f"There is no dump {path}. `train --enable-nan-guard True` writes one when a NaN "
@@ -66,18 +66,21 @@ def load_dump(path: str) -> tuple[NanDump, mujoco.MjModel]:
         )
     try:
         model = mujoco.MjModel.from_binary_path(str(dump.model_file))
-    except (ValueError, RuntimeError) as error:
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
         raise UserError(
             f"The model {dump.model_file} cannot be read by MuJoCo {mujoco.__version__}; it has to "
             f"be the version that wrote it. {error}"
         ) from error
-    missing = [name for name in ("state_spec", "state_size") if name not in dump.metadata]
-    if missing:
-        raise UserError(f"{path} is not a NaN dump of this version of mjlab: it has no {missing}.")
-    size = mujoco.mj_stateSize(model, dump.metadata["state_spec"])
-    if size != dump.metadata["state_size"]:
+    try:
+        size = mujoco.mj_stateSize(model, dump.metadata["state_spec"])
+        if size != dump.metadata["state_size"]:
+            raise ValueError(f"its states have {dump.metadata['state_size']} numbers, not {size}")
+        written, data = copy.copy(model), mujoco.MjData(model)
+        for step in dump.steps:
+            dump.apply(step, 0, written, data)
+    except Exception as error:
         raise UserError(
-            f"The dump {path} has states of {dump.metadata['state_size']} numbers and its model "
-            f"{dump.model_file.name} of {size}: they are not of the same simulation."
-        )
+            f"The dump {path} and its model {dump.model_file.name} are not of the same simulation: "
+            f"{error}."
+        ) from error
     return dump, model

@@ -30,6 +30,18 @@ _PHYSICS_STATE = ("qpos", "qvel", "act", "history")
 _MOCAP_STATE = ("mocap_pos", "mocap_quat")
 _INPUTS = ("ctrl", "xfrc_applied")
 _FORMAT = 2
+_ARCHIVE = b"PK\x03\x04"
+# Entries of the metadata that replaying needs, and their types.
+_METADATA = {
+    "model_file": str,
+    "num_envs_total": int,
+    "num_envs_dumped": int,
+    "dumped_env_ids": list,
+    "nan_env_ids": list,
+    "state_spec": int,
+    "state_size": int,
+    "detection_step": int,
+}
 
 
 @dataclass
@@ -257,21 +269,36 @@ class NanDump:
             FileNotFoundError: no such file.
             ValueError: a file that is not such a dump.
         """
-        import numpy as np
-
         path = Path(path).resolve()
+        with path.open("rb") as file:
+            is_archive = file.read(len(_ARCHIVE)) == _ARCHIVE
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
+            if not is_archive:
+                raise ValueError("it is not an .npz file")
+            arrays = _read_arrays(path)
             metadata = json.loads(str(arrays.pop("_metadata")))
-            model_file = path.parent / Path(metadata["model_file"]).name
-        except FileNotFoundError:
-            raise
-        except (KeyError, ValueError, TypeError, OSError) as error:
+            missing = [name for name in _METADATA if name not in metadata]
+            if missing:
+                raise ValueError(f"it has no {missing}")
+            for name, kind in _METADATA.items():
+                if not isinstance(metadata[name], kind):
+                    raise ValueError(f"its {name} is {metadata[name]!r}")
+            rows = metadata["num_envs_dumped"]
+            if rows != len(metadata["dumped_env_ids"]) or rows < 1:
+                raise ValueError(f"it says {rows} environments, and names others")
+            short = [name for name, array in arrays.items() if array.shape[:1] != (rows,)]
+            if short:
+                raise ValueError(f"{short} are not of {rows} environments")
+            steps = sorted(
+                int(name.rpartition("_")[2]) for name in arrays if name.startswith("states_step_")
+            )
+        except Exception as error:
+            # Damaged bytes make the readers fail in any way there is.
+            reason = " ".join(str(error).split()) or type(error).__name__
             raise ValueError(
-                f"{path} is not a NaN dump of this version of mjlab: {error}."
+                f"{path} is not a NaN dump of this version of mjlab, or is damaged: {reason}."
             ) from error
-        steps = sorted(int(name[-6:]) for name in arrays if name.startswith("states_step_"))
+        model_file = path.parent / Path(metadata["model_file"]).name
         return cls(metadata=metadata, model_file=model_file, steps=steps, arrays=arrays)
 
     def apply(self, step: int, row: int, mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
@@ -299,6 +326,26 @@ class NanDump:
         for name, values in self.arrays.items():
             if name.startswith("model_"):
                 _write_model_field(mj_model, name.removeprefix("model_"), values[row])
+
+
+def _read_arrays(path: Path) -> dict[str, np.ndarray[Any, Any]]:
+    import numpy as np
+
+    arrays = {}
+    with np.load(path, allow_pickle=False) as file:
+        for name in file.files:
+            try:
+                arrays[name] = file[name]
+            except ValueError as error:
+                if "allow_pickle" in str(error):
+                    raise ValueError(
+                        f"{name} holds Python objects, which a dump has none of; nothing was run"
+                    ) from error
+                raise
+            # Numpy returns the bytes of what is not an array.
+            if not isinstance(arrays[name], np.ndarray):
+                raise ValueError(f"{name} is not an array")
+    return arrays
 
 
 def _write_model_field(mj_model: mujoco.MjModel, name: str, value: Any) -> None:
