@@ -119,6 +119,42 @@ def test_the_view_takes_the_newest_weights_once(view):
     assert newest.take() is None
 
 
+HOLD = """
+import sys, time
+from pathlib import Path
+from mjlab.utils.os import create_locked
+folder = Path(sys.argv[1])
+folder.mkdir()
+lock = create_locked(folder / "lock")
+print("held", flush=True)
+time.sleep(60)
+"""
+
+
+def test_the_folder_of_a_killed_training_is_removed_at_the_next_start_and_not_before(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(live.tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(live, "_start", start("import sys; sys.stdin.read()"))
+    folder = tmp_path / "mjlab-live-abc"
+    # What another user could leave there.
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "lock").touch()
+    (tmp_path / "mjlab-live-planted").symlink_to(tmp_path / "elsewhere")
+    process = subprocess.Popen([sys.executable, "-c", HOLD, str(folder)], stdout=subprocess.PIPE)
+    try:
+        assert process.stdout is not None
+        process.stdout.readline()
+        LiveView(TASK, TrainConfig.from_task(TASK), FakeRunner()).on_end("finished")
+        assert folder.exists()
+    finally:
+        process.kill()
+        process.communicate()
+    LiveView(TASK, TrainConfig.from_task(TASK), FakeRunner()).on_end("finished")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["elsewhere", "mjlab-live-planted"]
+    assert (tmp_path / "elsewhere" / "lock").exists()
+
+
 def test_what_is_shown_is_the_runs_own_config_made_small():
     cfg = TrainConfig.from_task(TASK)
     cfg.env.scene.num_envs = 4096

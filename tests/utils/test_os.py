@@ -7,6 +7,7 @@ import functools
 import math
 import os
 import stat
+import subprocess
 import sys
 import types
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ from mjlab.utils.os import (
     get_checkpoint_path,
     get_wandb_checkpoint_path,
     own_folder,
+    remove_temporary_files,
     replacing,
 )
 
@@ -293,3 +295,37 @@ def test_a_folder_of_this_user_is_taken_whatever_it_is_in(tmp_path):
     (shared / "link").symlink_to(tmp_path)
     assert own_folder(shared / "link" / "dumps").is_dir()
     assert (tmp_path / "dumps").is_dir()
+
+
+WRITE = """
+import sys, time
+from pathlib import Path
+from mjlab.utils.os import replacing
+with replacing(Path(sys.argv[1])) as file:
+    file.write(b"half")
+    file.flush()
+    print("writing", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_temporary_file_is_removed_once_its_process_was_killed_and_not_before(tmp_path):
+    other = tmp_path / ".model_1.pt.abcdefgh.tmp"
+    other.touch()
+    command = [sys.executable, "-c", WRITE, str(tmp_path / "model_2.pt")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    process.stdout.readline()
+    try:
+        remove_temporary_files(tmp_path)
+        assert len(list(tmp_path.iterdir())) == 2
+    finally:
+        process.kill()
+        process.communicate()
+    assert len(list(tmp_path.iterdir())) == 2
+    remove_temporary_files(tmp_path)
+    assert list(tmp_path.iterdir()) == [other]
+    with replacing(tmp_path / "model_3.pt") as file:
+        remove_temporary_files(tmp_path)
+        file.write(b"whole")
+    assert (tmp_path / "model_3.pt").read_bytes() == b"whole"

@@ -19,9 +19,17 @@ from typing import IO, Any
 from mjlab.compat import older_names
 from mjlab.utils.string import qualified_name
 
+try:
+    import fcntl
+except ImportError:
+    # Windows.
+    fcntl = None
+
 logger = logging.getLogger(__name__)
 
 _WANDB_CACHE = "wandb_checkpoints"
+# See `temporary_path`. Those of other programs, and of earlier versions, carry no lock.
+_TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.tmp")
 _WANDB_CHECKPOINT = re.compile(r"model_(\d+)\.pt")
 
 
@@ -199,19 +207,68 @@ def replacing(path: Path, *, flush: bool = False) -> Generator[IO[bytes]]:
     who may read it, and a link at `path` is replaced instead of followed. `flush`: the content is on
     the disk before the file gets its name.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
-    # "x" makes a new file: it fails if a file or a link has that name.
-    file = open(temporary, "xb")  # noqa: SIM115
-    try:
-        with file:
+    with create_locked(temporary_path(path)) as file:
+        try:
             yield file
+            file.flush()
             if flush:
-                file.flush()
                 os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+            rename_locked(file, path)
+        except BaseException:
+            Path(file.name).unlink(missing_ok=True)
+            raise
+
+
+def temporary_path(path: Path) -> Path:
+    """Return a new name beside `path`, for a file of this process that will take its place."""
+    return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+
+
+def create_locked(path: Path) -> IO[bytes]:
+    """Make a file and open it; until it is closed, `remove_abandoned` leaves it alone.
+
+    Raises:
+        OSError: it cannot be made, or there is a file or a link of that name.
+    """
+    while True:
+        file = open(path, "xb")  # noqa: SIM115
+        if fcntl is not None:
+            # Not every file system has locks.
+            with contextlib.suppress(OSError):
+                fcntl.flock(file, fcntl.LOCK_EX)
+        # It may have been removed before it was locked.
+        if os.fstat(file.fileno()).st_nlink > 0:
+            return file
+        file.close()
+
+
+def rename_locked(file: IO[bytes], path: Path) -> None:
+    """Give a file of `create_locked` its name, and close it."""
+    if fcntl is None:
+        # Windows does not rename an open file.
+        file.close()
+    os.replace(file.name, path)
+    file.close()
+
+
+def remove_abandoned(path: Path) -> bool:
+    """Remove a file of `create_locked` if its process is gone; return whether it was removed."""
+    if fcntl is None:
+        return False
+    try:
+        with open(path, "rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            path.unlink()
+    except OSError:
+        return False
+    return True
+
+
+def remove_temporary_files(folder: Path) -> None:
+    """Remove the files in `folder` that a process was writing (`replacing`) when it was killed."""
+    for path in folder.glob(".*.tmp"):
+        if _TEMPORARY.fullmatch(path.name):
+            remove_abandoned(path)
 
 
 def own_folder(folder: Path) -> Path:
