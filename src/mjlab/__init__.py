@@ -2,16 +2,15 @@
 
 Importing this package does one thing beyond defining names: on Linux, where the EGL library is
 installed and the variable is not set already, it sets `MUJOCO_GL=egl`, so that MuJoCo renders
-without a display.
+without a display. A library in that variable that MuJoCo could not be imported with is switched off.
 """
 
 from __future__ import annotations
 
-import ctypes
-import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from mjlab.utils.graphics import choose_graphics_library
 
 if TYPE_CHECKING:
     TYRO_FLAGS: tuple[Any, ...]
@@ -20,18 +19,7 @@ MJLAB_SRC_PATH = Path(__file__).parent
 """Folder of this package."""
 
 
-def _prefer_egl() -> None:
-    if sys.platform != "linux" or "MUJOCO_GL" in os.environ:
-        return
-    # With the variable set, `import mujoco` fails where the library is missing.
-    try:
-        ctypes.CDLL("libEGL.so.1")
-    except OSError:
-        return
-    os.environ["MUJOCO_GL"] = "egl"
-
-
-_prefer_egl()
+choose_graphics_library()
 
 
 def __getattr__(name: str) -> Any:

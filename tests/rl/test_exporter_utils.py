@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from dataclasses import asdict
@@ -247,3 +248,15 @@ def test_configs_are_read_without_torch():
     program = "import mjlab.rl.config, sys; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.stdout == "False\n", done.stderr
+
+
+def test_an_exported_policy_obeys_the_umask(tmp_path: Path) -> None:
+    graph = onnx.helper.make_graph([], "empty", [], [])
+    path = tmp_path / "policy.onnx"
+    onnx.save(onnx.helper.make_model(graph), path)
+    before = os.umask(0o077)
+    try:
+        attach_metadata_to_onnx(str(path), {"a": 1.0})
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == 0o600

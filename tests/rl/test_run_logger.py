@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import types
 from pathlib import Path
@@ -210,3 +211,34 @@ def test_a_runner_with_a_loop_of_its_own_leaves_checkpoints_and_figures(
     assert plot_run(run).is_file()
     other = make_runner(tmp_path / "other")
     other.load(str(run / "model_1.pt"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "kept", "uploaded"),
+    [({}, True, False), ({"upload_git_diff": True}, True, True), ({"save_git_diff": False}, 0, 0)],
+)
+def test_only_the_given_repository_is_kept_and_nothing_of_it_uploaded_unless_asked_to(
+    make_runner, tmp_path: Path, monkeypatch, settings, kept, uploaded
+):
+    task = tmp_path / "my_tasks"
+    task.mkdir()
+    for command in (
+        "init",
+        "-c user.name=a -c user.email=a@b.c commit --allow-empty -m First",
+    ):
+        subprocess.run(["git", *command.split()], cwd=task, check=True, capture_output=True)
+    saved: list[str] = []
+    client: Any = types.ModuleType("wandb")
+    for name in ("init", "log", "finish"):
+        setattr(client, name, lambda *args, **kwargs: None)
+    client.save = lambda path, **kwargs: saved.append(Path(path).name)
+    client.config = types.SimpleNamespace(update=lambda values: None)
+    monkeypatch.setitem(sys.modules, "wandb", client)
+    monkeypatch.delenv("WANDB_DISABLE_CODE", raising=False)
+    runner = make_runner(tmp_path / "run", logger="wandb", **settings)
+    runner.add_git_repo_to_log(str(task / "__init__.py"))
+    runner.learn(1)
+    files = [path.name for path in tmp_path.glob("run/git/*")]
+    assert files == ["my_tasks.diff"] * bool(kept)
+    assert ("my_tasks.diff" in saved) == bool(uploaded)
+    assert (os.environ.pop("WANDB_DISABLE_CODE", "") == "true") == (not uploaded)

@@ -64,6 +64,30 @@ def task_with(monkeypatch) -> Callable[[Callable[[ManagerBasedRlEnvCfg], None]],
     return register
 
 
+# Where pages are served.
+
+
+@pytest.mark.parametrize("host", ["300.1.2.3", "203.0.113.7"])
+@pytest.mark.parametrize(
+    ("script", "arguments", "flag"),
+    [
+        ("play", (TASK, "--viewer", "viser"), "--host"),
+        ("train", (TASK, *SMALL, "--live"), "--live-host"),
+        ("viz_nan", ("dump.npz",), "--host"),
+        ("visualize_terrain", (), "--host"),
+        ("csv_to_npz", ("--input-file", "poses.csv", "--view", "True"), "--host"),
+    ],
+)
+def test_a_page_on_an_address_of_another_machine_is_refused_at_once(
+    run, monkeypatch, tmp_path, script, arguments, flag, host
+):
+    monkeypatch.chdir(tmp_path)
+    outcome = run(script, *arguments, flag, host)
+    assert outcome.status == 1
+    assert f"{flag}: expected an address of this machine, got {host!r}" in outcome.message
+    assert not list(tmp_path.iterdir())
+
+
 # What is asked for by name.
 
 

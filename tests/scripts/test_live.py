@@ -40,7 +40,7 @@ class FakeRunner:
 def start(code: str):
     """Return what starts a process of Python code instead of the view."""
 
-    def start(exchange: Exchange, port: int) -> subprocess.Popen:
+    def start(exchange: Exchange, host: str, port: int) -> subprocess.Popen:
         with open(exchange.log, "wb") as log:
             command = [sys.executable, "-c", code, str(exchange.folder)]
             return subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log)
@@ -117,6 +117,42 @@ def test_the_view_takes_the_newest_weights_once(view):
     assert torch.equal(network.weight, view._runner.network.weight)
     assert env.common_step_counter == 40
     assert newest.take() is None
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from mjlab.utils.os import create_locked
+folder = Path(sys.argv[1])
+folder.mkdir()
+lock = create_locked(folder / "lock")
+print("held", flush=True)
+time.sleep(60)
+"""
+
+
+def test_the_folder_of_a_killed_training_is_removed_at_the_next_start_and_not_before(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(live.tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(live, "_start", start("import sys; sys.stdin.read()"))
+    folder = tmp_path / "mjlab-live-abc"
+    # What another user could leave there.
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "lock").touch()
+    (tmp_path / "mjlab-live-planted").symlink_to(tmp_path / "elsewhere")
+    process = subprocess.Popen([sys.executable, "-c", HOLD, str(folder)], stdout=subprocess.PIPE)
+    try:
+        assert process.stdout is not None
+        process.stdout.readline()
+        LiveView(TASK, TrainConfig.from_task(TASK), FakeRunner()).on_end("finished")
+        assert folder.exists()
+    finally:
+        process.kill()
+        process.communicate()
+    LiveView(TASK, TrainConfig.from_task(TASK), FakeRunner()).on_end("finished")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["elsewhere", "mjlab-live-planted"]
+    assert (tmp_path / "elsewhere" / "lock").exists()
 
 
 def test_what_is_shown_is_the_runs_own_config_made_small():

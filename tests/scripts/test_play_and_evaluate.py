@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 
+import onnx
 import pytest
 from commands import SMALL
 
@@ -233,6 +234,42 @@ def test_a_policy_that_sees_images_trains_plays_and_is_scored(run, with_images, 
     )  # fmt: skip
     assert wrong.status == 1
     assert "takes flat observations only" in wrong.message
+
+
+def _truncate(model) -> bytes:
+    return model.SerializeToString()[:-500]
+
+
+def _shorten_a_bias(model) -> bytes:
+    bias = next(item for item in model.graph.initializer if len(item.dims) == 1)
+    bias.CopyFrom(onnx.numpy_helper.from_array(onnx.numpy_helper.to_array(bias)[:-1], bias.name))
+    return model.SerializeToString()
+
+
+def _rename_an_initializer(model) -> bytes:
+    model.graph.initializer[0].name += "_"
+    return model.SerializeToString()
+
+
+def _take_an_attribute(model) -> bytes:
+    node = next(node for node in model.graph.node if node.op_type == "Elu")
+    node.attribute[0].name = "beta"
+    return model.SerializeToString()
+
+
+@pytest.mark.parametrize("script", ["play", "evaluate"])
+@pytest.mark.parametrize(
+    "spoil",
+    [_truncate, _shorten_a_bias, _rename_an_initializer, _take_an_attribute, lambda model: b"text"],
+)
+def test_a_spoilt_onnx_file_is_one_message(run, trained, tmp_path, script, spoil):
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(spoil(onnx.load(next(trained.glob("*.onnx")))))
+    flags = HEADLESS if script == "play" else SHORT
+    outcome = run(script, TASK, *flags, "--checkpoint-file", str(path))
+    assert outcome.status == 1
+    assert str(path) in outcome.message
+    assert "Traceback" not in outcome.err
 
 
 def test_the_same_seed_gives_the_same_figures_and_another_does_not(run):

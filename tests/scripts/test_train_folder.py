@@ -9,6 +9,7 @@ from commands import SMALL, TASK
 
 from mjlab.rl import MjlabOnPolicyRunner
 from mjlab.scripts.run_folder import NewRunFolder
+from mjlab.utils.os import create_locked, temporary_path
 
 
 @pytest.fixture
@@ -69,6 +70,20 @@ def test_a_folder_with_a_checkpoint_is_never_removed(tmp_path):
     with NewRunFolder(tmp_path, "") as other:
         (other.path / "params").mkdir()
     assert list(tmp_path.iterdir()) == [folder.path]
+
+
+def test_what_a_killed_run_was_writing_is_removed_at_the_next_start(tmp_path):
+    older = tmp_path / "2026-01-01_00-00-00"
+    clips = older / "videos" / "train"
+    clips.mkdir(parents=True)
+    left = [temporary_path(path) for path in (older / "model_1.pt", clips / "rl-video-step-0.mp4")]
+    running = create_locked(temporary_path(older / "model_2.pt"))
+    for path in (*left, older / "model_0.pt"):
+        path.touch()
+    with running, NewRunFolder(tmp_path, ""):
+        pass
+    files = [path for path in older.rglob("*") if path.is_file()]
+    assert sorted(files) == sorted([older / "model_0.pt", Path(running.name)])
 
 
 @pytest.mark.parametrize("name", ["a/b", "../up", "/abs", "a\\b"])

@@ -26,6 +26,7 @@ from mjlab.tasks.registry import (
     load_runner_cls,
     register_mjlab_task,
     require_task,
+    task_source,
 )
 
 
@@ -265,3 +266,11 @@ def test_the_registry_reads_as_a_dict():
     assert load_env_cfg("Again", play=True).decimation == 2
     with pytest.raises(KeyError, match="Other"):
         tasks["Other"]
+
+
+def test_the_file_that_registers_a_task_is_its_source():
+    register_mjlab_task("Test-Task", env_cfg(), rl_cfg=RslRlOnPolicyRunnerCfg())
+    assert task_source("Test-Task") == __file__
+    source = task_source("Mjlab-Cartpole-Swingup")
+    assert source is not None
+    assert source.endswith("mjlab/tasks/cartpole/__init__.py")

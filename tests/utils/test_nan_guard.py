@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -185,6 +186,27 @@ def test_a_dump_replaces_the_links_of_an_earlier_one(
     assert (tmp_path / "nan_dump_latest.npz").resolve() == guard.dump_path
 
 
+def test_a_dump_goes_elsewhere_if_another_user_planted_its_folder(
+    model: mujoco.MjModel,
+    data: SimpleNamespace,
+    tmp_path: Path,
+    plant: Callable[[Path, Path], None],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    victim, shared = tmp_path / "victim", tmp_path / "shared"
+    victim.mkdir()
+    shared.mkdir()
+    shared.chmod(0o1777)
+    plant(shared / "mjlab", victim)
+    guard = make_guard(model, shared / "mjlab" / "nan_dumps")
+    run_until_nan(guard, data, [0])
+    assert not list(victim.iterdir())
+    assert guard.dump_path is not None
+    assert guard.dump_path.parent == tmp_path / "cache" / "mjlab" / "nan_dumps"
+    assert NanDump.load(guard.dump_path).steps == [0, 1, 2, 3]
+
+
 def test_asking_for_a_substep_that_is_not_in_the_dump_says_what_is(
     model: mujoco.MjModel, data: SimpleNamespace, tmp_path: Path
 ) -> None:
@@ -193,6 +215,17 @@ def test_asking_for_a_substep_that_is_not_in_the_dump_says_what_is(
     dump = NanDump.load(guard.dump_path or "")
     with pytest.raises(ValueError, match="substeps 0 to 3 of 1 environments.*substep 9"):
         dump.apply(9, 0, model, mujoco.MjData(model))
+
+
+def test_a_dump_after_a_million_substeps_is_read_in_order(
+    model: mujoco.MjModel, data: SimpleNamespace, tmp_path: Path
+) -> None:
+    guard = make_guard(model, tmp_path)
+    guard._steps = 999_998
+    run_until_nan(guard, data, [0])
+    dump = NanDump.load(guard.dump_path or "")
+    assert dump.steps == [999_998, 999_999, 1_000_000, 1_000_001]
+    dump.apply(1_000_001, 0, model, mujoco.MjData(model))
 
 
 def test_a_file_that_is_no_dump_is_refused(tmp_path: Path) -> None:

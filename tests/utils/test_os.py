@@ -6,6 +6,8 @@ import enum
 import functools
 import math
 import os
+import stat
+import subprocess
 import sys
 import types
 from dataclasses import dataclass, field
@@ -17,7 +19,14 @@ import pytest
 import torch
 import yaml
 
-from mjlab.utils.os import dump_yaml, get_checkpoint_path, get_wandb_checkpoint_path
+from mjlab.utils.os import (
+    dump_yaml,
+    get_checkpoint_path,
+    get_wandb_checkpoint_path,
+    own_folder,
+    remove_temporary_files,
+    replacing,
+)
 
 
 class Color(enum.IntEnum):
@@ -105,11 +114,10 @@ def test_suffix_and_folders_are_added_and_order_is_kept(tmp_path):
 def test_a_failing_write_leaves_the_previous_file(tmp_path, monkeypatch):
     dump_yaml(tmp_path / "a.yaml", {"old": 1})
 
-    def full_disk(self, text):
-        self.touch()
+    def full_disk(source, target):
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(Path, "write_text", full_disk)
+    monkeypatch.setattr(os, "replace", full_disk)
     with pytest.raises(OSError, match="No space"):
         dump_yaml(tmp_path / "a.yaml", {"new": 2})
     monkeypatch.undo()
@@ -224,3 +232,100 @@ def test_a_broken_download_is_not_cached(tmp_path, wandb_files):
     with pytest.raises(ConnectionError):
         get_wandb_checkpoint_path(tmp_path, Path("me/project/abc"))
     assert list((tmp_path / "wandb_checkpoints" / "abc").iterdir()) == []
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664)])
+def test_a_replaced_file_has_the_permissions_that_the_umask_leaves(tmp_path, umask, mode):
+    before = os.umask(umask)
+    try:
+        with replacing(tmp_path / "file") as file:
+            file.write(b"new")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == mode
+    assert os.listdir(tmp_path) == ["file"]
+
+
+def test_a_replaced_file_is_the_old_one_until_the_new_one_is_whole(tmp_path):
+    path = tmp_path / "file"
+    path.write_bytes(b"old")
+    with pytest.raises(KeyboardInterrupt), replacing(path) as file:
+        file.write(b"ne")
+        file.flush()
+        assert path.read_bytes() == b"old"
+        raise KeyboardInterrupt
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["file"]
+
+
+def test_a_link_is_replaced_and_not_followed(tmp_path):
+    target = tmp_path / "target"
+    target.write_bytes(b"another's")
+    (tmp_path / "file").symlink_to(target)
+    with replacing(tmp_path / "file") as file:
+        file.write(b"new")
+    assert target.read_bytes() == b"another's"
+    assert not (tmp_path / "file").is_symlink()
+
+
+@pytest.mark.parametrize("planted", ["link", "folder"])
+def test_a_folder_that_another_user_planted_is_not_written_to(
+    tmp_path, monkeypatch, caplog, plant, planted
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    shared.chmod(0o1777)
+    plant(shared / "mjlab", victim if planted == "link" else None)
+    own = own_folder(shared / "mjlab" / "nan_dumps")
+    assert own == tmp_path / "cache" / "mjlab" / "nan_dumps"
+    assert own.is_dir()
+    assert not list(victim.iterdir())
+    for fact in (str(shared / "mjlab"), str(own), "another user"):
+        assert fact in caplog.text
+
+
+def test_a_folder_of_this_user_is_taken_whatever_it_is_in(tmp_path):
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    shared.chmod(0o1777)
+    assert own_folder(shared / "mjlab" / "nan_dumps") == shared / "mjlab" / "nan_dumps"
+    (shared / "link").symlink_to(tmp_path)
+    assert own_folder(shared / "link" / "dumps").is_dir()
+    assert (tmp_path / "dumps").is_dir()
+
+
+WRITE = """
+import sys, time
+from pathlib import Path
+from mjlab.utils.os import replacing
+with replacing(Path(sys.argv[1])) as file:
+    file.write(b"half")
+    file.flush()
+    print("writing", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_temporary_file_is_removed_once_its_process_was_killed_and_not_before(tmp_path):
+    other = tmp_path / ".model_1.pt.abcdefgh.tmp"
+    other.touch()
+    command = [sys.executable, "-c", WRITE, str(tmp_path / "model_2.pt")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    process.stdout.readline()
+    try:
+        remove_temporary_files(tmp_path)
+        assert len(list(tmp_path.iterdir())) == 2
+    finally:
+        process.kill()
+        process.communicate()
+    assert len(list(tmp_path.iterdir())) == 2
+    remove_temporary_files(tmp_path)
+    assert list(tmp_path.iterdir()) == [other]
+    with replacing(tmp_path / "model_3.pt") as file:
+        remove_temporary_files(tmp_path)
+        file.write(b"whole")
+    assert (tmp_path / "model_3.pt").read_bytes() == b"whole"

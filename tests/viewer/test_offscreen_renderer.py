@@ -13,6 +13,7 @@ import torch
 from viewer_fakes import FakeEnv
 
 from mjlab.viewer import OffscreenRenderer, RenderingUnavailableError, ViewerConfig
+from mjlab.viewer.gl_context import open_renderer
 from mjlab.viewer.viewer_config import OriginType
 
 
@@ -104,6 +105,17 @@ def test_it_renders_without_a_display_although_mujoco_was_imported_before_mjlab(
     without = ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")
     environ = {name: value for name, value in os.environ.items() if name not in without}
     subprocess.run([sys.executable, "-c", code], check=True, env=environ)
+
+
+@pytest.mark.usefixtures("gl")
+def test_an_image_larger_than_the_machine_can_draw_is_told_as_that() -> None:
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    model.vis.global_.offwidth = 100_000
+    with pytest.raises(RenderingUnavailableError, match="100000 x 64 pixels") as caught:
+        open_renderer(model, 64, 100_000)
+    assert "at most" in str(caught.value)
+    assert "--video-width" in str(caught.value)
+    assert "install" not in str(caught.value)
 
 
 @pytest.mark.usefixtures("gl")

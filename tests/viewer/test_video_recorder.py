@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -265,6 +266,34 @@ def test_a_clip_is_finished_when_the_program_ends_without_closing_it(tmp_path) -
     )
     assert subprocess.run([sys.executable, "-c", code, str(tmp_path)]).returncode == 3
     assert len(frames(tmp_path / "x.mp4")) == 1
+
+
+def test_the_partial_clip_of_a_killed_program_goes_with_the_next_clip(tmp_path) -> None:
+    code = (
+        "import sys, time, numpy as np; from pathlib import Path\n"
+        "from mjlab.viewer.clip_writer import ClipWriter\n"
+        "clip = ClipWriter(Path(sys.argv[1]) / 'x.mp4', 30)\n"
+        "clip.add(np.zeros((4, 4, 3), np.uint8)); print('recording', flush=True); time.sleep(60)"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE)
+    try:
+        assert process.stdout is not None
+        process.stdout.readline()
+        other = ClipWriter(tmp_path / "y.mp4", 30)
+        other.add(np.zeros((4, 4, 3), np.uint8))
+        other.close()
+        assert len(names(tmp_path)) == 2
+    finally:
+        process.kill()
+        process.communicate()
+    # The encoder may outlive its program by a moment, and make the file again.
+    deadline = time.monotonic() + 20.0
+    while names(tmp_path) != ["y.mp4", "z.gif"] and time.monotonic() < deadline:
+        last = ClipWriter(tmp_path / "z.gif", 30)
+        last.add(np.zeros((4, 4, 3), np.uint8))
+        last.close()
+    assert names(tmp_path) == ["y.mp4", "z.gif"]
 
 
 @pytest.mark.usefixtures("gl")

@@ -12,14 +12,14 @@ import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import torch
 
 from mjlab.rl.learners import Learner
 from mjlab.rl.plain_data import as_plain_data
+from mjlab.utils.os import replacing
 
-_TEMPORARY_SUFFIX = ".tmp"
 # Only in checkpoints of SAC.
 _SAC_KEY = "sac_state_dict"
 
@@ -72,39 +72,21 @@ def save_checkpoint(data: Mapping[str, Any], path: str | os.PathLike[str]) -> No
             f"{error}. A checkpoint may hold tensors, numbers, strings, None, and dicts, lists and "
             "tuples of those; convert this entry, or leave it out."
         ) from error
-    temporary: str | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(
-            dir=path.parent, prefix=f".{path.name}.", suffix=_TEMPORARY_SUFFIX
-        )
-        with os.fdopen(descriptor, "wb") as file:
+        with replacing(path, flush=True) as file:
             _write(data, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
-        temporary = None
         _flush_folder(path.parent)
     except OSError as error:
         raise CheckpointError(_save_message(path, error)) from error
-    finally:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
 
 
-def _write(data: Mapping[str, Any], file: io.IOBase) -> None:
+def _write(data: Mapping[str, Any], file: IO[bytes]) -> None:
     # Serialized in memory first, because torch's zip writer turns a failing `write` of the file
     # below it into a RuntimeError that hides the reason.
     buffer = io.BytesIO()
     torch.save(dict(data), buffer)
     file.write(buffer.getbuffer())
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def _flush_folder(folder: Path) -> None:

@@ -252,6 +252,10 @@ class RslRlBaseRunnerCfg:
     in (-1, 1) anyway: the scale of the action term sets how far they reach."""
     upload_model: bool = True
     """Whether checkpoints and exported policies are uploaded to Weights & Biases."""
+    save_git_diff: bool = field(default=True, kw_only=True)
+    """Keep the commit and the uncommitted changes of the task's repository in the run's folder (`git/`)."""
+    upload_git_diff: bool = field(default=False, kw_only=True)
+    """Upload them to Weights & Biases, too."""
     evaluation: EvaluationCfg = field(default_factory=EvaluationCfg, kw_only=True)
     """What counts as solved."""
 

@@ -241,11 +241,18 @@ class OnnxPolicy(torch.nn.Module):
         names = self.metadata.get("observation_group")
         return None if names is None else names.split(",")
 
+    @property
+    def groups(self) -> list[str]:
+        """The groups of observations that the policy reads."""
+        return [*self.image_shapes, *self._flat_groups()]
+
+    def _flat_groups(self) -> list[str]:
+        return [] if self._state is None else self._named_groups() or ["actor"]
+
     def _flat(self, observations: Any) -> torch.Tensor:
         if isinstance(observations, torch.Tensor):
             return observations
-        groups = self._named_groups() or ["actor"]
-        return torch.cat([observations[name] for name in groups], dim=-1)
+        return torch.cat([observations[name] for name in self._flat_groups()], dim=-1)
 
     def _run(self, inputs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """Return the actions, and what is to be remembered, by name."""
@@ -335,8 +342,21 @@ def load_onnx_policy(path: Path, env: Any, device: str) -> OnnxPolicy:
     Raises:
         OnnxPolicyError: it cannot be played, or not in this environment.
     """
-    policy = OnnxPolicy(path, device)
-    policy.check_fits(env.unwrapped)
+    try:
+        policy = OnnxPolicy(path, device)
+        policy.check_fits(env.unwrapped)
+        # Once, so that a damaged graph is told before anything is shown or measured.
+        shapes = env.unwrapped.observation_manager.group_obs_dim
+        policy({name: torch.zeros(2, *shapes[name], device=device) for name in policy.groups})
+        policy.reset()
+    except OnnxPolicyError:
+        raise
+    except Exception as error:
+        reason = (str(error).splitlines() or [""])[0]
+        raise OnnxPolicyError(
+            f"The policy {path} cannot be computed: {reason or type(error).__name__}. The file is "
+            "damaged, or not a policy of this environment."
+        ) from error
     return policy
 
 

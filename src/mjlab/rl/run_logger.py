@@ -5,12 +5,15 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import os
 import statistics
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from mjlab.rl.checkpoint import ensure_writable_folder
+from mjlab.rl.git_diff import write_git_diff
 from mjlab.rl.progress import IterationStats
 from mjlab.rl.rsl import Logger, enable_wandb
 
@@ -37,6 +40,8 @@ class RunLogger(Logger):
         that `process_env_step` gets (the step's duration, where rewards are scaled by it)."""
         super().__init__(*args, **kwargs)
         self._reward_unit = reward_unit
+        # rsl_rl's would be the repository around the virtual environment.
+        self.git_status_repos = []
         self._session_time = 0.0
         # Sums over the running episodes, and those of the last finished ones.
         self._episode_sums = [
@@ -69,7 +74,7 @@ class RunLogger(Logger):
         return bool(self.cfg["algorithm"].get("rnd_cfg"))
 
     def init_logging_writer(self) -> None:
-        """Open the event file.
+        """Open the event file, and keep the state of the code of `git_status_repos`.
 
         Raises:
             RunFolderError: the run folder cannot be written to.
@@ -80,6 +85,8 @@ class RunLogger(Logger):
         if self.log_dir is not None and not self.disable_logs:
             ensure_writable_folder(self.log_dir)
             self.cfg["logger"] = _writer_config(wanted, self.cfg)
+        # Not by rsl_rl, which uploads it wherever it logs to.
+        sources, self.git_status_repos = self.git_status_repos, []
         with contextlib.redirect_stdout(io.StringIO()) as printed:
             try:
                 super().init_logging_writer()
@@ -90,8 +97,22 @@ class RunLogger(Logger):
             finally:
                 # Runners read from their config which service there is.
                 self.cfg["logger"] = wanted
+                self.git_status_repos = sources
+        if self.log_dir is not None and not self.disable_logs:
+            self._keep_code_state(Path(self.log_dir))
         for line in filter(None, printed.getvalue().splitlines()):
             logger.debug("%s", line)
+
+    def _keep_code_state(self, run_dir: Path) -> None:
+        if self.cfg.get("save_git_diff", True):
+            for source in self.git_status_repos:
+                diff = write_git_diff(run_dir, Path(source))
+                if diff is not None and self.cfg.get("upload_git_diff", False):
+                    # TensorBoard's writer uploads nothing.
+                    getattr(self.writer, "save_file", lambda path: None)(str(diff))
+        # rsl_rl makes the folder in any case.
+        with contextlib.suppress(OSError):
+            (run_dir / "git").rmdir()
 
     def process_env_step(
         self,
@@ -307,6 +328,9 @@ def _writer_config(wanted: str | dict[str, Any], cfg: dict[str, Any]) -> str | d
     """Return what rsl_rl makes the writer from."""
     if wanted == "wandb":
         wanted = {"class_name": "WandbLogWriter", "project_name": cfg.get("wandb_project")}
+    if not cfg.get("upload_git_diff", False):
+        # wandb makes a difference of its own, of the repository around the working folder.
+        os.environ.setdefault("WANDB_DISABLE_CODE", "true")
     if isinstance(wanted, dict) and wanted.get("class_name") == "WandbLogWriter":
         enable_wandb()
     return wanted

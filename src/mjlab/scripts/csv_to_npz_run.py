@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from mjlab.tasks.tracking.motion_kinematics import (
     recording_of,
     resampled,
 )
+from mjlab.viewer.page_server import check_address
 
 if TYPE_CHECKING:
     import mujoco
@@ -54,6 +55,8 @@ class CsvToNpzConfig:
     """Serve a page in the browser that plays the motion."""
     port: int = 8080
     """Port of that page; the next free one where it is taken."""
+    host: str = field(default="127.0.0.1", kw_only=True)
+    """Address that it is served on; 0.0.0.0 serves the whole network."""
     upload: bool = False
     """Upload the motion to Weights & Biases as an artifact, and link it into the registry."""
     device: str | None = None
@@ -65,7 +68,7 @@ def convert(cfg: CsvToNpzConfig) -> Path:
     """Convert as `cfg` says; return the path of the motion.
 
     Raises:
-        UserError: a flag makes no sense.
+        UserError, ValueError: a flag makes no sense.
         MotionFileError: the input is no recording of this robot.
     """
     if not cfg.input_file:
@@ -74,6 +77,8 @@ def convert(cfg: CsvToNpzConfig) -> Path:
         if not getattr(cfg, name) > 0.0:
             flag = name.replace("_", "-")
             raise UserError(f"--{flag} is {getattr(cfg, name)}; it has to be above 0.")
+    if cfg.view:
+        check_address(cfg.host, cfg.port, "--")
     robot = _robot(cfg.robot)
     source = Path(cfg.input_file)
     name = cfg.output_name or source.stem
@@ -97,7 +102,7 @@ def convert(cfg: CsvToNpzConfig) -> Path:
     if cfg.view:
         from mjlab.scripts.motion_page import show_motion
 
-        show_motion(motion, _stage(robot), cfg.port)
+        show_motion(motion, _stage(robot), cfg.host, cfg.port)
     return path
 
 

@@ -13,6 +13,7 @@ import io
 import logging
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -23,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from mjlab.rl.progress import IterationStats, TrainingObserver
 from mjlab.scripts.cli import UserError
+from mjlab.utils.os import create_locked, remove_abandoned
 
 if TYPE_CHECKING:
     from mjlab.rl import MjlabOnPolicyRunner
@@ -35,6 +37,9 @@ logger = logging.getLogger(__name__)
 _SECONDS_BETWEEN_WEIGHTS = 1.0
 _LARGEST_SHARE = 0.01
 
+_PREFIX = "mjlab-live-"
+# Held by training, so that the folder of one that was killed can be told.
+_LOCK = "lock"
 _NUM_ENVS = 4
 _SECONDS_TO_START = 20.0
 _SECONDS_TO_END = 3.0
@@ -105,10 +110,14 @@ class LiveView(TrainingObserver):
         """
         self._runner = runner
         job = _pickled(LiveJob(task, _env_to_show(cfg), cfg.agent, type(runner)))
-        self._folder = tempfile.TemporaryDirectory(prefix="mjlab-live-")
+        _remove_abandoned_folders()
+        self._folder = tempfile.TemporaryDirectory(prefix=_PREFIX)
+        self._lock = create_locked(Path(self._folder.name) / _LOCK)
         self._exchange = Exchange(Path(self._folder.name))
         self._next_weights = 0.0
-        self._process: subprocess.Popen | None = _start(self._exchange, cfg.live_port)
+        self._process: subprocess.Popen | None = _start(
+            self._exchange, cfg.live_host, cfg.live_port
+        )
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(len(job).to_bytes(8, "little") + job)
@@ -146,6 +155,7 @@ class LiveView(TrainingObserver):
         process, self._process = self._process, None
         if process is not None:
             _end(process)
+        self._lock.close()
         self._folder.cleanup()
 
     def _write_weights(self, stats: IterationStats | None) -> None:
@@ -162,6 +172,18 @@ class LiveView(TrainingObserver):
         reason = (self._exchange.log.read_text(errors="replace").strip().splitlines() or [""])[-1]
         logger.warning("The live view has ended; training goes on. %s", reason)
         return True
+
+
+def _remove_abandoned_folders() -> None:
+    """Remove the folders of training processes that were killed."""
+    if os.name != "posix":
+        return
+    for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        # Other users may plant what they like there.
+        with contextlib.suppress(OSError):
+            is_own = folder.lstat().st_uid == os.geteuid() and not folder.is_symlink()
+            if is_own and remove_abandoned(folder / _LOCK):
+                shutil.rmtree(folder)
 
 
 def _env_to_show(cfg: TrainConfig) -> Any:
@@ -189,13 +211,16 @@ def _pickled(job: LiveJob) -> bytes:
         ) from error
 
 
-def _start(exchange: Exchange, port: int) -> subprocess.Popen:
+def _start(exchange: Exchange, host: str, port: int) -> subprocess.Popen:
     environment = {k: v for k, v in os.environ.items() if k not in _DISTRIBUTED}
     # The GPU is the training's, and so are all threads but one.
     environment |= {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1", "MJLAB_TORCH_THREADS": "1"}
     with open(exchange.log, "wb") as log:
         return subprocess.Popen(
-            [sys.executable, "-m", "mjlab.scripts.live_view", str(exchange.folder), str(port)],
+            [
+                *(sys.executable, "-m", "mjlab.scripts.live_view"),
+                *(str(exchange.folder), host, str(port)),
+            ],
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=log,

@@ -27,7 +27,7 @@ _LOWEST_PRIORITY = 19
 
 
 def main() -> None:
-    """Show what standard input says. The arguments are the folder of the exchange and the port."""
+    """Show what standard input says; the arguments are the exchange's folder, address and port."""
     # Training decides what Ctrl-C means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     size = int.from_bytes(sys.stdin.buffer.read(8), "little")
@@ -37,7 +37,7 @@ def main() -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     from mjlab.scripts.live import Exchange
 
-    show(pickled, Exchange(Path(sys.argv[1])), int(sys.argv[2]))
+    show(pickled, Exchange(Path(sys.argv[1])), sys.argv[2], int(sys.argv[3]))
 
 
 def lower_priority() -> None:
@@ -51,16 +51,16 @@ def lower_priority() -> None:
         os.nice(_LOWEST_PRIORITY)
 
 
-def show(pickled: bytes, exchange: Exchange, port: int) -> None:
+def show(pickled: bytes, exchange: Exchange, host: str, port: int) -> None:
     """Serve the page of a pickled `LiveJob`; build what it shows when the first browser connects.
 
     Until then, neither torch nor the task are imported.
     """
-    import viser
+    from mjlab.viewer.page_server import page_url, serve_page
 
-    server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
+    server = serve_page(host, port)
     temporary = exchange.url.with_suffix(".tmp")
-    temporary.write_text(f"http://localhost:{server.get_port()}")
+    temporary.write_text(page_url(server))
     temporary.replace(exchange.url)
     note = server.gui.add_markdown("Preparing the view …")
     while not server.get_clients():

@@ -6,12 +6,14 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import mujoco
-import viser
 from mjviser import ViserMujocoScene
 
 from mjlab.scripts.csv_to_npz_run import pose
+from mjlab.viewer.page_server import page_url, serve_page
 
 if TYPE_CHECKING:
+    import viser
+
     from mjlab.tasks.tracking.motion_file import Motion
 
 
@@ -59,11 +61,11 @@ class MotionPage:
             self._frame = float(self._slider.value)
 
 
-def show_motion(motion: Motion, model: mujoco.MjModel, port: int) -> None:
+def show_motion(motion: Motion, model: mujoco.MjModel, host: str, port: int) -> None:
     """Serve the page until Ctrl-C."""
-    server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
+    server = serve_page(host, port)
     page = MotionPage(server, motion, model)
-    print(f"Open http://localhost:{server.get_port()} in a browser. Ctrl-C ends.", flush=True)
+    print(f"Open {page_url(server)} in a browser. Ctrl-C ends.", flush=True)
     last = time.perf_counter()
     try:
         while True:

@@ -18,6 +18,7 @@ from mjlab.scripts.policy import (
     make_policy,
 )
 from mjlab.scripts.run_folder import is_run_folder
+from mjlab.viewer.page_server import check_address
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -69,8 +70,7 @@ def run_play(task: str, cfg: PlayConfig) -> None:
         raise UserError("--viewer none needs --num-steps, because nothing else would end it.")
     if cfg.video_length < 1:
         raise UserError(f"--video-length is {cfg.video_length}; it has to be at least 1.")
-    if not 1 <= cfg.port <= 65535:
-        raise UserError(f"--port is {cfg.port}; ports go from 1 to 65535.")
+    check_address(cfg.host, cfg.port, "--")
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
     env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="play")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mjlab.scripts.cli import UserError, tell
+from mjlab.utils.os import remove_temporary_files
 
 _INFO_FILE = "run.json"
 _CHECKPOINT = re.compile(r"model_(\d+)\.pt")
@@ -42,6 +43,10 @@ class NewRunFolder:
         from mjlab.rl.checkpoint import ensure_writable_folder
 
         ensure_writable_folder(self._experiment)
+        # Of runs that were killed.
+        for run_dir in run_folders(self._experiment):
+            for folder in (run_dir, run_dir / "params", *run_dir.glob("videos/*")):
+                remove_temporary_files(folder)
         name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
         if self._run_name:
             name += f"_{self._run_name}"

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjlab.scripts.cli import UserError
+from mjlab.viewer.page_server import check_address
 
 if TYPE_CHECKING:
     from mjlab.scripts.train_run import TrainConfig
@@ -49,8 +50,7 @@ def _check_numbers(cfg: TrainConfig) -> None:
     for flag, value in counts.items():
         if value < 1:
             raise UserError(f"{flag.replace('_', '-')} is {value}; it has to be at least 1.")
-    if not 1 <= cfg.live_port <= 65535:
-        raise UserError(f"--live-port is {cfg.live_port}; ports go from 1 to 65535.")
+    check_address(cfg.live_host, cfg.live_port, "--live-")
 
 
 def _check_names(cfg: TrainConfig) -> None:

@@ -34,7 +34,7 @@ from mjlab.scripts.run_folder import (
 from mjlab.scripts.task_options import options_of, prepare_env_cfg, with_task_options
 from mjlab.scripts.train_checks import check_flags
 from mjlab.scripts.training_device import training_device
-from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls, task_source
 from mjlab.utils.processes import ProcessRank, cores_per_process, process_rank
 
 if TYPE_CHECKING:
@@ -89,6 +89,8 @@ class TrainConfig:
     """Serve a page in the browser that shows the policy as it learns."""
     live_port: int = 8080
     """Port of that page; the next free one where it is taken."""
+    live_host: str = field(default="127.0.0.1", kw_only=True)
+    """Address that it is served on; 0.0.0.0 serves the whole network."""
     gpu_ids: list[int] | Literal["all"] | None = field(default_factory=lambda: [0])
     """Indices of the GPUs to use where --device is not given, or `all`; with several, a process
     for each is started. None trains on the CPU."""
@@ -311,7 +313,10 @@ def _build_runner(
     # numbers the environment drew while it was built.
     seed_rng(cfg.agent.seed)
     further = options_of(task, cfg).runner_kwargs()
-    return runner_cls(env, asdict(cfg.agent), str(run_dir), device, **further)
+    runner = runner_cls(env, asdict(cfg.agent), str(run_dir), device, **further)
+    if (source := task_source(task)) is not None:
+        runner.add_git_repo_to_log(source)
+    return runner
 
 
 class _Beginning(TrainingObserver):

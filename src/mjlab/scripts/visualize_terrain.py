@@ -45,7 +45,11 @@ def run_visualize_terrain(cfg: VisualizeTerrainConfig) -> None:
 
     Raises:
         UserError: no such preset, or figures that no terrain can have.
+        ValueError: the page cannot be served at that address.
     """
+    from mjlab.viewer.page_server import check_address, page_url, serve_page
+
+    check_address(cfg.host, cfg.port, "--")
     from mjlab.terrains.config import ALL_TERRAIN_PRESETS
 
     if cfg.terrain != "all" and cfg.terrain not in ALL_TERRAIN_PRESETS:
@@ -58,15 +62,11 @@ def run_visualize_terrain(cfg: VisualizeTerrainConfig) -> None:
             f"num_levels is {cfg.num_levels}, size {cfg.size} and seed {cfg.seed}; they must be "
             "from 1 to 10, from 4 to 16 m, and not negative."
         )
-    import viser
-
     from mjlab.scripts.terrain_page import TerrainPage
 
-    server = viser.ViserServer(host=cfg.host, port=cfg.port, verbose=False)
+    server = serve_page(cfg.host, cfg.port)
     page = TerrainPage(server, cfg.terrain, cfg.num_levels, cfg.size, cfg.seed, cfg.robot)
-    print(
-        f"Serving the terrain on http://localhost:{server.get_port()} (Ctrl-C stops).", flush=True
-    )
+    print(f"Serving the terrain on {page_url(server)} (Ctrl-C stops).", flush=True)
     try:
         page.run()
     finally:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import zipfile
+import copy
 from dataclasses import dataclass
 
 import mujoco
 
 from mjlab.scripts.cli import UserError
 from mjlab.utils.nan_guard import NanDump
+from mjlab.viewer.page_server import check_address, page_url, serve_page
 
 
 @dataclass(frozen=True)
@@ -26,17 +27,15 @@ def run_viz_nan(path: str, cfg: VizNanConfig) -> None:
 
     Raises:
         UserError: the dump or its model is missing or cannot be read.
+        ValueError: the page cannot be served at that address.
     """
-    if not 1 <= cfg.port <= 65535:
-        raise UserError(f"--port is {cfg.port}; ports go from 1 to 65535.")
+    check_address(cfg.host, cfg.port, "--")
     dump, model = load_dump(path)
-    import viser
-
     from mjlab.scripts.nan_page import NanPage
 
-    server = viser.ViserServer(host=cfg.host, port=cfg.port, verbose=False)
+    server = serve_page(cfg.host, cfg.port)
     page = NanPage(server, dump, model)
-    print(f"Serving {path} on http://localhost:{server.get_port()} (Ctrl-C stops).", flush=True)
+    print(f"Serving {path} on {page_url(server)} (Ctrl-C stops).", flush=True)
     try:
         page.run()
     finally:
@@ -51,8 +50,8 @@ def load_dump(path: str) -> tuple[NanDump, mujoco.MjModel]:
     """
     try:
         dump = NanDump.load(path)
-    except zipfile.BadZipFile as error:
-        raise UserError(f"The dump {path} is damaged, or only in part here: {error}.") from error
+    except ValueError as error:
+        raise UserError(str(error)) from error
     except FileNotFoundError:
         raise UserError(
             f"There is no dump {path}. `train --enable-nan-guard True` writes one when a NaN "
@@ -67,18 +66,21 @@ def load_dump(path: str) -> tuple[NanDump, mujoco.MjModel]:
         )
     try:
         model = mujoco.MjModel.from_binary_path(str(dump.model_file))
-    except (ValueError, RuntimeError) as error:
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
         raise UserError(
             f"The model {dump.model_file} cannot be read by MuJoCo {mujoco.__version__}; it has to "
             f"be the version that wrote it. {error}"
         ) from error
-    missing = [name for name in ("state_spec", "state_size") if name not in dump.metadata]
-    if missing:
-        raise UserError(f"{path} is not a NaN dump of this version of mjlab: it has no {missing}.")
-    size = mujoco.mj_stateSize(model, dump.metadata["state_spec"])
-    if size != dump.metadata["state_size"]:
+    try:
+        size = mujoco.mj_stateSize(model, dump.metadata["state_spec"])
+        if size != dump.metadata["state_size"]:
+            raise ValueError(f"its states have {dump.metadata['state_size']} numbers, not {size}")
+        written, data = copy.copy(model), mujoco.MjData(model)
+        for step in dump.steps:
+            dump.apply(step, 0, written, data)
+    except Exception as error:
         raise UserError(
-            f"The dump {path} has states of {dump.metadata['state_size']} numbers and its model "
-            f"{dump.model_file.name} of {size}: they are not of the same simulation."
-        )
+            f"The dump {path} and its model {dump.model_file.name} are not of the same simulation: "
+            f"{error}."
+        ) from error
     return dump, model

@@ -63,6 +63,7 @@ class _Task:
     runner_cls: Any
     profiles: dict[str, Any]
     options: Any
+    source: str | None
 
 
 _tasks: dict[str, _Task] = {}
@@ -110,8 +111,9 @@ def register_mjlab_task(
                 f"Task {task_id!r} has a profile named {profile!r}; a name is one word of letters, "
                 "digits, '-' and '_', such as 'cpu', and not 'None'."
             )
+    source = sys._getframe(1).f_globals.get("__file__")
     _tasks[task_id] = _Task(
-        env_cfg, play_env_cfg, rl_cfg, runner_cls, dict(profiles or {}), options
+        env_cfg, play_env_cfg, rl_cfg, runner_cls, dict(profiles or {}), options, source
     )
 
 
@@ -237,6 +239,11 @@ def load_options_cls(task_name: str) -> type[TaskOptions] | None:
     """Return the class of a task's own options, or None if it has none; raises likewise."""
     options = _find(task_name).options
     return _imported(task_name, options) if isinstance(options, str) else options
+
+
+def task_source(task_name: str) -> str | None:
+    """Return the file that registered a task; None if that was no file. Raises UnknownTaskError."""
+    return _find(task_name).source
 
 
 def require_task(task_name: str) -> None:

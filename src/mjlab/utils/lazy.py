@@ -13,6 +13,11 @@ def lazy_names(module_name: str, homes: Mapping[str, str]) -> Callable[[str], An
     def __getattr__(name: str) -> Any:
         if name not in homes:
             raise AttributeError(f"module {module_name!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(homes[name]), name)
+        try:
+            module = importlib.import_module(homes[name])
+        except AttributeError as error:
+            # `from package import name` would hide it behind "cannot import name".
+            raise ImportError(f"{homes[name]} failed to be imported: {error}") from error
+        return getattr(module, name)
 
     return __getattr__

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import shutil
 import tempfile
 from collections import deque
 from collections.abc import Callable, Generator, Mapping
@@ -14,6 +13,8 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from mjlab.utils.os import own_folder, replacing
 
 if TYPE_CHECKING:
     import mujoco
@@ -29,6 +30,18 @@ _PHYSICS_STATE = ("qpos", "qvel", "act", "history")
 _MOCAP_STATE = ("mocap_pos", "mocap_quat")
 _INPUTS = ("ctrl", "xfrc_applied")
 _FORMAT = 2
+_ARCHIVE = b"PK\x03\x04"
+# Entries of the metadata that replaying needs, and their types.
+_METADATA = {
+    "model_file": str,
+    "num_envs_total": int,
+    "num_envs_dumped": int,
+    "dumped_env_ids": list,
+    "nan_env_ids": list,
+    "state_spec": int,
+    "state_size": int,
+    "detection_step": int,
+}
 
 
 @dataclass
@@ -43,7 +56,8 @@ class NanGuardCfg:
     output_dir: str = field(
         default_factory=lambda: str(Path(tempfile.gettempdir()) / "mjlab" / "nan_dumps")
     )
-    """Folder into which the dump is written."""
+    """Folder into which the dump is written. If it is in a shared folder, such as `/tmp`, and another
+    user made it, the dump goes to `~/.cache/mjlab/` instead."""
     max_envs_to_dump: int = 5
     """Number of environments in a dump; the first that went NaN are taken."""
 
@@ -162,8 +176,7 @@ class NanGuard:
 
         ids = nan_ids[: self.cfg.max_envs_to_dump]
         stamp = datetime.now().strftime("%Y%m%d_%H%M%S")
-        folder = Path(self.cfg.output_dir)
-        folder.mkdir(parents=True, exist_ok=True)
+        folder = own_folder(Path(self.cfg.output_dir))
         path, model_path = (
             folder / f"nan_dump_{stamp}.npz",
             folder / f"model_{stamp}.mjb",
@@ -173,10 +186,12 @@ class NanGuard:
             for name, values in self.model_fields().items():
                 arrays[f"model_{name}"] = values[ids].cpu().numpy()
         arrays["_metadata"] = np.array(json.dumps(self._metadata(nan_ids, ids, stamp, model_path)))
-        mujoco.mj_saveModel(self.mj_model, str(model_path))
-        partial = path.with_suffix(".partial.npz")
-        np.savez_compressed(partial, **arrays)
-        partial.replace(path)
+        model = np.empty(mujoco.mj_sizeModel(self.mj_model), np.uint8)
+        mujoco.mj_saveModel(self.mj_model, None, model)
+        with replacing(model_path) as file:
+            file.write(model.tobytes())
+        with replacing(path) as file:
+            np.savez_compressed(file, **arrays)
         _link(folder / "nan_dump_latest.npz", path)
         _link(folder / "model_latest.mjb", model_path)
         return path
@@ -254,21 +269,36 @@ class NanDump:
             FileNotFoundError: no such file.
             ValueError: a file that is not such a dump.
         """
-        import numpy as np
-
         path = Path(path).resolve()
+        with path.open("rb") as file:
+            is_archive = file.read(len(_ARCHIVE)) == _ARCHIVE
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
+            if not is_archive:
+                raise ValueError("it is not an .npz file")
+            arrays = _read_arrays(path)
             metadata = json.loads(str(arrays.pop("_metadata")))
-            model_file = path.parent / Path(metadata["model_file"]).name
-        except FileNotFoundError:
-            raise
-        except (KeyError, ValueError, TypeError, OSError) as error:
+            missing = [name for name in _METADATA if name not in metadata]
+            if missing:
+                raise ValueError(f"it has no {missing}")
+            for name, kind in _METADATA.items():
+                if not isinstance(metadata[name], kind):
+                    raise ValueError(f"its {name} is {metadata[name]!r}")
+            rows = metadata["num_envs_dumped"]
+            if rows != len(metadata["dumped_env_ids"]) or rows < 1:
+                raise ValueError(f"it says {rows} environments, and names others")
+            short = [name for name, array in arrays.items() if array.shape[:1] != (rows,)]
+            if short:
+                raise ValueError(f"{short} are not of {rows} environments")
+            steps = sorted(
+                int(name.rpartition("_")[2]) for name in arrays if name.startswith("states_step_")
+            )
+        except Exception as error:
+            # Damaged bytes make the readers fail in any way there is.
+            reason = " ".join(str(error).split()) or type(error).__name__
             raise ValueError(
-                f"{path} is not a NaN dump of this version of mjlab: {error}."
+                f"{path} is not a NaN dump of this version of mjlab, or is damaged: {reason}."
             ) from error
-        steps = sorted(int(name[-6:]) for name in arrays if name.startswith("states_step_"))
+        model_file = path.parent / Path(metadata["model_file"]).name
         return cls(metadata=metadata, model_file=model_file, steps=steps, arrays=arrays)
 
     def apply(self, step: int, row: int, mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
@@ -298,6 +328,26 @@ class NanDump:
                 _write_model_field(mj_model, name.removeprefix("model_"), values[row])
 
 
+def _read_arrays(path: Path) -> dict[str, np.ndarray[Any, Any]]:
+    import numpy as np
+
+    arrays = {}
+    with np.load(path, allow_pickle=False) as file:
+        for name in file.files:
+            try:
+                arrays[name] = file[name]
+            except ValueError as error:
+                if "allow_pickle" in str(error):
+                    raise ValueError(
+                        f"{name} holds Python objects, which a dump has none of; nothing was run"
+                    ) from error
+                raise
+            # Numpy returns the bytes of what is not an array.
+            if not isinstance(arrays[name], np.ndarray):
+                raise ValueError(f"{name} is not an array")
+    return arrays
+
+
 def _write_model_field(mj_model: mujoco.MjModel, name: str, value: Any) -> None:
     owner: Any = mj_model if hasattr(mj_model, name) else mj_model.opt
     present = getattr(owner, name)
@@ -313,4 +363,5 @@ def _link(link: Path, target: Path) -> None:
     try:
         os.symlink(target.name, link)
     except OSError:
-        shutil.copyfile(target, link)
+        with replacing(link) as file:
+            file.write(target.read_bytes())

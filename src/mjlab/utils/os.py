@@ -6,17 +6,30 @@ import contextlib
 import dataclasses
 import enum
 import functools
+import logging
 import os
 import re
+import secrets
+import stat
 import tempfile
 from collections.abc import Generator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from mjlab.compat import older_names
 from mjlab.utils.string import qualified_name
 
+try:
+    import fcntl
+except ImportError:
+    # Windows.
+    fcntl = None
+
+logger = logging.getLogger(__name__)
+
 _WANDB_CACHE = "wandb_checkpoints"
+# See `temporary_path`. Those of other programs, and of earlier versions, carry no lock.
+_TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.tmp")
 _WANDB_CHECKPOINT = re.compile(r"model_(\d+)\.pt")
 
 
@@ -45,8 +58,8 @@ def dump_yaml(filename: Path, data: dict[str, Any], sort_keys: bool = False) -> 
         sort_keys=sort_keys,
         default_flow_style=False,
     )
-    with _replacing(filename) as temporary:
-        temporary.write_text(text)
+    with replacing(filename) as file:
+        file.write(text.encode())
 
 
 def to_plain(value: Any, _parents: tuple[int, ...] = ()) -> Any:
@@ -187,14 +200,104 @@ def get_wandb_checkpoint_path(
 
 
 @contextlib.contextmanager
-def _replacing(path: Path) -> Generator[Path, None, None]:
-    """Yield a temporary path that takes the place of `path` if the block succeeds."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+def replacing(path: Path, *, flush: bool = False) -> Generator[IO[bytes]]:
+    """Yield a binary file that takes the place of `path` if the block succeeds.
+
+    It is written beside `path` and renamed, so `path` appears whole or not at all. The umask decides
+    who may read it, and a link at `path` is replaced instead of followed. `flush`: the content is on
+    the disk before the file gets its name.
+    """
+    with create_locked(temporary_path(path)) as file:
+        try:
+            yield file
+            file.flush()
+            if flush:
+                os.fsync(file.fileno())
+            rename_locked(file, path)
+        except BaseException:
+            Path(file.name).unlink(missing_ok=True)
+            raise
+
+
+def temporary_path(path: Path) -> Path:
+    """Return a new name beside `path`, for a file of this process that will take its place."""
+    return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+
+
+def create_locked(path: Path) -> IO[bytes]:
+    """Make a file and open it; until it is closed, `remove_abandoned` leaves it alone.
+
+    Raises:
+        OSError: it cannot be made, or there is a file or a link of that name.
+    """
+    while True:
+        file = open(path, "xb")  # noqa: SIM115
+        if fcntl is not None:
+            # Not every file system has locks.
+            with contextlib.suppress(OSError):
+                fcntl.flock(file, fcntl.LOCK_EX)
+        # It may have been removed before it was locked.
+        if os.fstat(file.fileno()).st_nlink > 0:
+            return file
+        file.close()
+
+
+def rename_locked(file: IO[bytes], path: Path) -> None:
+    """Give a file of `create_locked` its name, and close it."""
+    if fcntl is None:
+        # Windows does not rename an open file.
+        file.close()
+    os.replace(file.name, path)
+    file.close()
+
+
+def remove_abandoned(path: Path) -> bool:
+    """Remove a file of `create_locked` if its process is gone; return whether it was removed."""
+    if fcntl is None:
+        return False
     try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        with open(path, "rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            path.unlink()
+    except OSError:
+        return False
+    return True
+
+
+def remove_temporary_files(folder: Path) -> None:
+    """Remove the files in `folder` that a process was writing (`replacing`) when it was killed."""
+    for path in folder.glob(".*.tmp"):
+        if _TEMPORARY.fullmatch(path.name):
+            remove_abandoned(path)
+
+
+def own_folder(folder: Path) -> Path:
+    """Make `folder` and return it, or a folder of that name in the user's cache if it is foreign.
+
+    Foreign is a folder that another user could have planted, or a link to one: in a folder that
+    everyone may write to, such as `/tmp`, a part of the path belongs to neither this user nor root.
+
+    Raises:
+        OSError: the folder cannot be made.
+    """
+    path = Path(os.path.abspath(folder))
+    for part in (*reversed(path.parents), path):
+        if not os.path.lexists(part):
+            with contextlib.suppress(FileExistsError):
+                part.mkdir()
+        if _is_foreign(part):
+            cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+            own = cache / "mjlab" / path.name
+            own.mkdir(parents=True, exist_ok=True)
+            logger.warning("%s belongs to another user; %s is used instead.", part, own)
+            return own
+    return folder
+
+
+def _is_foreign(path: Path) -> bool:
+    if not hasattr(os, "geteuid") or not path.parent.stat().st_mode & stat.S_IWOTH:
+        return False
+    return path.lstat().st_uid not in (os.geteuid(), 0)
 
 
 __getattr__ = older_names(__name__)

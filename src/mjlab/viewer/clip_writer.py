@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import os
 import subprocess
 import tempfile
 from pathlib import Path
 from typing import IO
 
 import numpy as np
+
+from mjlab.utils.os import (
+    create_locked,
+    remove_temporary_files,
+    rename_locked,
+    temporary_path,
+)
 
 _CODECS = {
     ".mp4": "-an -c:v libx264 -pix_fmt yuv420p -crf 20 -movflags +faststart",
@@ -42,7 +48,8 @@ class ClipWriter:
         self.path = path
         self.fps = fps
         self.num_frames = 0
-        self._partial = path.with_name(f".partial-{path.name}")
+        # The encoder writes into it, and this process holds its lock.
+        self._partial: IO[bytes] | None = None
         self._encoder: subprocess.Popen[bytes] | None = None
         self._messages: IO[bytes] | None = None
         self._shape: tuple[int, ...] = ()
@@ -85,12 +92,14 @@ class ClipWriter:
         # An encoder that is gone already says why by its exit status.
         with contextlib.suppress(OSError):
             encoder.stdin.close()
+        assert self._partial is not None
         if encoder.wait() != 0:
-            self._partial.unlink(missing_ok=True)
+            self._partial.close()
+            Path(self._partial.name).unlink(missing_ok=True)
             raise OSError(
                 f"Cannot write the video {self.path}: {self._complaint(encoder.returncode)}"
             )
-        os.replace(self._partial, self.path)
+        rename_locked(self._partial, self.path)
         return self.path
 
     def _open(self, image: np.ndarray) -> None:
@@ -98,6 +107,8 @@ class ClipWriter:
 
         self._shape = image.shape
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        remove_temporary_files(self.path.parent)
+        self._partial = create_locked(temporary_path(self.path))
         # A pipe for its messages could fill up and block it.
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115
         height, width = image.shape[:2]
@@ -108,7 +119,8 @@ class ClipWriter:
                 *("-loglevel", "error", "-y"),
                 *raw.split(),
                 *_CODECS[self.path.suffix].split(),
-                str(self._partial),
+                *("-f", self.path.suffix.removeprefix(".")),
+                self._partial.name,
             ],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,

@@ -23,18 +23,47 @@ def open_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Rend
     is not set) is used here all the same.
 
     Raises:
-        RenderingUnavailableError: No image can be drawn; the text says what to install.
+        RenderingUnavailableError: No image can be drawn, or none of that size; the text says what to
+            install or change.
     """
     # Where a library is missing, PyOpenGL and MuJoCo fail in a dozen ways (ImportError,
     # AttributeError, FatalError, ...), some of them while being imported. All mean the same.
     try:
-        wanted = os.environ.get("MUJOCO_GL", "").lower() or "egl"
-        if sys.platform != "linux" or wanted not in _WITHOUT_DISPLAY:
-            return mujoco.Renderer(model, height, width, max_geom=_MAX_GEOMS)
-        from mujoco.rendering.classic import gl_context
-
-        context = importlib.import_module(f"mujoco.{wanted}").GLContext
-        with mock.patch.object(gl_context, "GLContext", context):
-            return mujoco.Renderer(model, height, width, max_geom=_MAX_GEOMS)
+        return _open(model, height, width)
     except Exception as error:
-        raise RenderingUnavailableError.offscreen(error) from error
+        raise _explained(error, height, width) from error
+
+
+def _open(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+    wanted = os.environ.get("MUJOCO_GL", "").lower() or "egl"
+    if sys.platform != "linux" or wanted not in _WITHOUT_DISPLAY:
+        return mujoco.Renderer(model, height, width, max_geom=_MAX_GEOMS)
+    from mujoco.rendering.classic import gl_context
+
+    context = importlib.import_module(f"mujoco.{wanted}").GLContext
+    # MuJoCo has none if it was imported with MUJOCO_GL=disable.
+    with mock.patch.object(gl_context, "GLContext", context, create=True):
+        return mujoco.Renderer(model, height, width, max_geom=_MAX_GEOMS)
+
+
+def _explained(error: Exception, height: int, width: int) -> RenderingUnavailableError:
+    """Return the error for an image that cannot be drawn: is it the machine, or the size?"""
+    try:
+        small = _open(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8)
+    except Exception:
+        return RenderingUnavailableError.offscreen(error)
+    try:
+        from OpenGL import GL
+
+        limit = int(GL.glGetIntegerv(GL.GL_MAX_RENDERBUFFER_SIZE))
+        most = f" It draws at most {limit} x {limit}, if the memory is enough."
+    except Exception:
+        most = ""
+    finally:
+        small.close()
+    reason = " ".join(str(error).split())
+    return RenderingUnavailableError(
+        f"The graphics library of this machine cannot draw an image of {width} x {height} pixels "
+        f"({reason}).{most} Choose a smaller width or height; those of clips are "
+        "--video-width and --video-height."
+    )

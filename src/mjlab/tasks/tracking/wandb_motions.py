@@ -8,6 +8,7 @@ from typing import Any
 
 from mjlab.tasks.tracking.motion_file import MotionFileError
 from mjlab.tasks.tracking.motion_record import FOLDER, INDEX, recorded_motions
+from mjlab.utils.os import own_folder
 
 _ARTIFACT_TYPE = "motions"
 _ARTIFACT_FILE = "motion.npz"
@@ -54,7 +55,7 @@ def fetch_motions_of_run(run_path: str) -> list[Path]:
         files = [file for file in run.files() if file.name.startswith(f"{FOLDER}/")]
         if any(file.name == f"{FOLDER}/{INDEX}" for file in files):
             folder = Path(tempfile.gettempdir()) / "mjlab-motions" / Path(run_path).name
-            folder.mkdir(parents=True, exist_ok=True)
+            folder = own_folder(folder)
             for file in files:
                 file.download(str(folder), replace=True)
             return recorded_motions(folder)

@@ -12,6 +12,9 @@ import viser
 
 from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction
 from mjlab.viewer.camera import resolve_camera
+from mjlab.viewer.page_server import DEFAULT_HOST as DEFAULT_HOST
+from mjlab.viewer.page_server import DEFAULT_PORT as DEFAULT_PORT
+from mjlab.viewer.page_server import page_url, serve_page
 from mjlab.viewer.protocols import forget
 from mjlab.viewer.viser.checkpoints import CheckpointManager as CheckpointManager
 from mjlab.viewer.viser.checkpoints import CheckpointPanel
@@ -30,11 +33,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-DEFAULT_HOST = "127.0.0.1"
-DEFAULT_PORT = 8080
-
 _PANEL_PERIOD_S = 0.2
-_LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 class UpdateReason(enum.Enum):
@@ -80,14 +79,12 @@ class ViserPlayViewer(BaseViewer):
             checkpoint_manager: Checkpoints to choose from. None: no such tab.
             host: Address to serve on; `0.0.0.0` serves the whole network.
             port: Port to serve on; the next free one where it is taken.
+
+        Raises:
+            ValueError: this machine does not have the address `host`.
         """
         super().__init__(env, policy, frame_rate, verbosity)
-        if viser_server is None and host not in _LOOPBACK:
-            log.warning(
-                "The viewer is served on %s: everyone who can reach this machine can control it.",
-                host,
-            )
-        self._server = viser_server or viser.ViserServer(host=host, port=port, verbose=False)
+        self._server = viser_server or serve_page(host, port)
         self._checkpoint_manager = checkpoint_manager
         self._closed = False
         self._scene: MjlabViserScene | None = None
@@ -110,9 +107,7 @@ class ViserPlayViewer(BaseViewer):
     @property
     def url(self) -> str:
         """Where to point a browser on this machine."""
-        host = self._server.get_host()
-        shown = "localhost" if host in ("0.0.0.0", "::", *_LOOPBACK) else host
-        return f"http://{shown}:{self._server.get_port()}"
+        return page_url(self._server)
 
     @property
     def scene(self) -> MjlabViserScene:
