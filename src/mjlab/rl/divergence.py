@@ -13,6 +13,8 @@ from mjlab.sim.divergence import cure_of, describe_dof, fastest_dof
 
 # Terms may be NaN in the first step of all episodes, and iterations of SAC are short.
 _MIN_BROKEN_STEPS = 16
+# Of a few environments, one may diverge.
+_MIN_DIVERGED_EPISODES = 4
 
 
 class DivergedError(RuntimeError):
@@ -42,7 +44,9 @@ class RolloutWatch:
         """Begin a rollout with the current speeds."""
         if self._sim is not None:
             self._previous_peak, self._peak = self._peak, self._speeds()
-            self._resets_before = self._env.nan_resets.clone()
+            # Environments of other classes may have a simulation, too.
+            if (resets := getattr(self._env, "nan_resets", None)) is not None:
+                self._resets_before = resets.clone()
 
     def update(self) -> None:
         """Update the highest speeds after a step."""
@@ -53,14 +57,15 @@ class RolloutWatch:
         """Refuse to learn from a rollout of `num_steps` steps that teaches nothing.
 
         Raises:
-            DivergedError: most environments diverged.
+            DivergedError: most environments diverged, in at least 4 episodes.
             BrokenTermError: a reward or a termination was NaN or infinite in every environment, in every
                 step (of at least 16).
         """
         if self._resets_before is None:
             return
-        diverged = int((self._env.nan_resets > self._resets_before).sum())
-        if 2 * diverged > self._env.num_envs:
+        episodes = self._env.nan_resets - self._resets_before
+        diverged = int((episodes > 0).sum())
+        if 2 * diverged > self._env.num_envs and int(episodes.sum()) >= _MIN_DIVERGED_EPISODES:
             timestep = float(self._sim.mj_model.opt.timestep)
             cause = self._explanation() or (
                 f"the timestep is {timestep:g} s. Use a smaller sim.mujoco.timestep."
