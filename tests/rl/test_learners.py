@@ -81,7 +81,10 @@ def test_to_act_takes_the_least_replay():
     acting = acting_cfg(cfg)
     assert acting.pop("algorithm") == {**asdict(cfg.algorithm), "replay_steps": 1}
     assert acting == {key: value for key, value in asdict(cfg).items() if key != "algorithm"}
-    assert acting_cfg(RslRlOnPolicyRunnerCfg()) == asdict(RslRlOnPolicyRunnerCfg())
+    ppo = RslRlOnPolicyRunnerCfg()
+    acting = acting_cfg(ppo)
+    assert acting.pop("algorithm") == {**asdict(ppo.algorithm), "num_mini_batches": 1}
+    assert acting == {key: value for key, value in asdict(ppo).items() if key != "algorithm"}
 
 
 def test_sac_refuses_images_and_networks_of_others():

@@ -109,10 +109,14 @@ def _shared_fields(cfg: RslRlBaseRunnerCfg, learner: Learner) -> dict[str, Any]:
 
 
 def acting_cfg(cfg: RslRlBaseRunnerCfg) -> dict[str, Any]:
-    """Return `cfg` as the dict of a runner that acts and does not learn: with the least replay."""
+    """Return `cfg` as the dict of a runner that acts and does not learn.
+
+    It has the least replay, and one mini-batch, which there are always environments enough for.
+    """
     acting = asdict(cfg)
-    if learner_of(cfg) == "sac":
-        acting["algorithm"]["replay_steps"] = 1
+    for name in ("replay_steps", "num_mini_batches"):
+        if name in acting["algorithm"]:
+            acting["algorithm"][name] = 1
     return acting
 
 

@@ -16,7 +16,7 @@ from mjlab.rl.learners import Learner, learner_of
 from mjlab.rl.progress import TrainingObserver
 from mjlab.scripts.policy import prepare_teacher
 from mjlab.scripts.process_output import ProcessOutput, log_file, output_of
-from mjlab.scripts.profiles import parse_with_choices, suggest_profile
+from mjlab.scripts.profiles import parse_with_choices, suggest_profile, tell_foreign_learner
 from mjlab.scripts.resume import (
     check_learner_resumes,
     checkpoint_to_resume,
@@ -161,6 +161,8 @@ def _train(
         keep_number_of_environments(task, cfg, checkpoint)
     else:
         suggest_profile(task, cfg.profile, device)
+        if rank.is_first:
+            tell_foreign_learner(task, cfg.profile, learner_of(cfg.agent))
     with same_fate():
         prepare_teacher(task, cfg.agent, checkpoint)
     with _run_folder(cfg, rank, output) as folder:

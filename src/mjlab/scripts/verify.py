@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mjlab.scripts.cli import (
+    BadCallError,
     UserError,
     parse_flags,
     resolve_device,
@@ -48,7 +49,7 @@ _USAGE = task_usage(
         "verify Mjlab-Velocity-Flat-Unitree-Go1 --device cpu --seed 1",
     ],
 )
-_OUTSIDE, _BAD_CALL = 1, 2
+_OUTSIDE = 1
 # Rows of the printed table.
 _ROWS = 5
 
@@ -68,12 +69,6 @@ class VerifyConfig:
     """Go on with the newest `verify` run of this task and seed, which was interrupted."""
     log_root: str = "logs/rsl_rl"
     """Folder of all runs."""
-
-
-class BadCallError(UserError):
-    """A mistake in the command line, found before training."""
-
-    exit_status = _BAD_CALL
 
 
 def load_reference(task: str, cfg: VerifyConfig) -> Reference:
