@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import re
 import shutil
+import signal
+import threading
+from collections.abc import Callable, Generator
 from datetime import datetime
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from mjlab.scripts.cli import UserError, tell
@@ -25,13 +31,14 @@ class NewRunFolder:
     def __init__(self, experiment: Path, run_name: str) -> None:
         self._experiment = experiment
         self._run_name = run_name
-        self._kept = False
+        self.is_kept = False
+        """True once the run has begun."""
         self.path = experiment
         """The folder; it is there once the context is entered."""
 
     def keep(self) -> None:
         """Leave the folder where it is: the run has begun."""
-        self._kept = True
+        self.is_kept = True
 
     def __enter__(self) -> NewRunFolder:
         """Make the folder.
@@ -57,8 +64,42 @@ class NewRunFolder:
 
     def __exit__(self, *exception: object) -> None:
         # A checkpoint is worth more than tidiness, whoever wrote it.
-        if not self._kept and not checkpoints_in(self.path):
+        if not self.is_kept and not checkpoints_in(self.path):
             shutil.rmtree(self.path, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def exit_by_signal(unless: Callable[[], bool]) -> Generator[None]:
+    """Let SIGTERM and SIGHUP leave the block by SystemExit, so that it is cleaned up behind them.
+
+    Where `unless` returns True they do what they always did. Those that are handled or ignored
+    already are left alone, and so are all outside the main thread.
+    """
+    replaced: list[int] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        restore()
+        if unless():
+            os.kill(os.getpid(), number)
+            return
+        tell(f"{signal.Signals(number).name}: stopped before the first iteration.")
+        raise SystemExit(128 + number)
+
+    def restore() -> None:
+        while replaced:
+            if signal.getsignal(number := replaced.pop()) is handle:
+                signal.signal(number, signal.SIG_DFL)
+
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)
+            if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+                signal.signal(number, handle)
+                replaced.append(number)
+    try:
+        yield
+    finally:
+        restore()
 
 
 class SharedRunFolder:

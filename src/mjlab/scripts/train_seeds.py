@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import subprocess
@@ -11,6 +12,7 @@ from types import FrameType
 
 from mjlab.scripts.cli import BadCallError, UserError, is_given, run_command, task_and_flags, task_usage
 from mjlab.scripts.run_folder import read_run_info, run_folders
+from mjlab.utils.processes import PARENT_VARIABLE
 
 # Signals that end this process, and what the training process gets for each: it handles the first
 # two by saving, while SIGHUP (the terminal was closed) would lose what was learned.
@@ -120,7 +122,11 @@ def run_forwarding_signals(command: list[str], seconds: float | None = None) -> 
     try:
         # A session of its own, because a terminal sends Ctrl-C to all processes of its session,
         # and a second signal tells training to stop at once.
-        child = subprocess.Popen(command, start_new_session=True)
+        child = subprocess.Popen(
+            command,
+            env={**os.environ, PARENT_VARIABLE: str(os.getpid())},
+            start_new_session=True,
+        )
         for number in early:
             forward(number)
         try:
