@@ -238,10 +238,18 @@ def named_checkpoint(path: Path, task: str) -> Path:
 
 
 def run_folders(experiment: Path) -> list[Path]:
-    """Return the run folders of an experiment, newest first (their names begin with the time)."""
+    """Return the run folders of an experiment, the one whose checkpoints were changed last first.
+
+    Names, which begin with the time of the start, decide between equals and without checkpoints.
+    """
     if not experiment.is_dir():
         return []
-    return sorted((path for path in experiment.iterdir() if path.is_dir()), reverse=True)
+    runs = [path for path in experiment.iterdir() if path.is_dir()]
+    return sorted(runs, key=lambda run: (_last_change(run), run.name), reverse=True)
+
+
+def _last_change(run_dir: Path) -> int:
+    return max((path.stat().st_mtime_ns for path in checkpoints_in(run_dir)), default=0)
 
 
 def _missing(path: Path, task: str) -> str:
