@@ -38,14 +38,16 @@ def test_what_a_folder_says_grows_and_the_newest_counts(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
 
 
-@pytest.mark.parametrize("text", [None, "", "{half", "[1, 2]"])
+@pytest.mark.parametrize("text", [None, "", "{half", "[1, 2]", "[" * 10**4, "9" * 5000])
 def test_a_folder_that_says_nothing_readable_says_nothing(tmp_path, text):
     if text is not None:
         (tmp_path / "run.json").write_text(text)
     assert read_run_info(tmp_path) == {}
 
 
-@pytest.mark.parametrize("text", [None, "", "a: [", "just text", "- 1"])
+@pytest.mark.parametrize(
+    "text", [None, "", "a: [", "just text", "- 1", "a: " + "[" * 10**4, "a: " + "9" * 5000]
+)
 def test_unreadable_parameters_are_none(tmp_path, text):
     if text is not None:
         (tmp_path / "params").mkdir()

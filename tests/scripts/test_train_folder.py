@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -93,3 +97,61 @@ def test_an_experiment_may_be_a_folder_in_a_folder(attempt, tmp_path):
     outcome, _ = attempt("--agent.experiment-name", "group/mine", "--agent.run-name", "a..b")
     assert outcome.status == 0, outcome.err
     assert len(list((tmp_path / "logs" / "group" / "mine").glob("*_a..b/model_1.pt"))) == 1
+
+
+def test_a_folder_that_takes_no_more_is_told_without_tracebacks(tmp_path):
+    # As on a file system that turned read-only, the event file can no longer be written.
+    program = (
+        "import resource, signal\n"
+        "from mjlab.scripts import train_run\n"
+        "def limit(self, stats):\n"
+        "    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "    resource.setrlimit(resource.RLIMIT_FSIZE, (16, resource.RLIM_INFINITY))\n"
+        "train_run._Beginning.on_iteration = limit\n"
+        "from mjlab.scripts.train import main\n"
+        "main()\n"
+    )
+    flags = [TASK, *SMALL, "--log-root", str(tmp_path), "--agent.max-iterations", "60"]
+    flags += ["--agent.save-interval", "1000"]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *flags], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    (run_dir,) = (tmp_path / "cartpole").iterdir()
+    assert f"error: The checkpoint '{run_dir}" in done.stderr
+    assert done.stderr.count(f"no longer written to {run_dir}") <= 1
+
+
+def test_leftovers_of_killed_writers_are_removed_and_no_others(tmp_path):
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    run_dir, host = tmp_path / "old", socket.gethostname()
+    run_dir.mkdir()
+    names = {
+        "dead": f".model_3.pt.{host}.{ended.pid}.abc.tmp",
+        "running": f".model_3.pt.{host}.{os.getpid()}.abc.tmp",
+        "elsewhere": f".model_3.pt.other-{host}.{ended.pid}.abc.tmp",
+        "older": ".model_3.pt.abc.tmp",
+        "oldest": ".model_4.pt.abc.tmp",
+    }
+    for name in names.values():
+        (run_dir / name).touch()
+    os.utime(run_dir / names["oldest"], (1e9, 1e9))
+    with NewRunFolder(tmp_path, ""):
+        left = {path.name for path in run_dir.iterdir()}
+    assert left == {names[kind] for kind in ("running", "elsewhere", "older")}
+
+
+def test_a_killed_writer_leaves_what_is_removed(tmp_path):
+    (tmp_path / "old").mkdir()
+    program = (
+        "import os, sys\nfrom mjlab.rl import checkpoint\n"
+        "checkpoint._write = lambda *_: os.kill(os.getpid(), 9)\n"
+        "checkpoint.save_checkpoint({}, sys.argv[1])\n"
+    )
+    path = tmp_path / "old" / "model_1.pt"
+    subprocess.run([sys.executable, "-c", program, str(path)], check=False)
+    assert len(list(path.parent.iterdir())) == 1
+    with NewRunFolder(tmp_path, ""):
+        assert list(path.parent.iterdir()) == []

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import io
 import os
 import pickle
 import re
+import socket
 import tempfile
+import time
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,6 +22,8 @@ from mjlab.rl.learners import Learner
 from mjlab.rl.plain_data import as_plain_data
 
 _TEMPORARY_SUFFIX = ".tmp"
+# Seconds after which a temporary file is nobody's, if its writer is not known: a day.
+_SECONDS_TO_KEEP = 86400.0
 # Only in checkpoints of SAC.
 _SAC_KEY = "sac_state_dict"
 
@@ -75,7 +80,9 @@ def save_checkpoint(data: Mapping[str, Any], path: str | os.PathLike[str]) -> No
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor, temporary = tempfile.mkstemp(
-            dir=path.parent, prefix=f".{path.name}.", suffix=_TEMPORARY_SUFFIX
+            dir=path.parent,
+            prefix=f".{path.name}.{socket.gethostname()}.{os.getpid()}.",
+            suffix=_TEMPORARY_SUFFIX,
         )
         with os.fdopen(descriptor, "wb") as file:
             _write(data, file)
@@ -90,6 +97,35 @@ def save_checkpoint(data: Mapping[str, Any], path: str | os.PathLike[str]) -> No
     finally:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove temporary files of checkpoints below `folder` whose writers were killed.
+
+    A name says which process of which machine wrote the file. Those of running processes are kept; so
+    are, for a day, those of other machines and of files that do not say.
+    """
+    for path in folder.glob(f"*/.model_*.pt.*{_TEMPORARY_SUFFIX}"):
+        words = path.name.removesuffix(_TEMPORARY_SUFFIX).rsplit(".", 2)
+        is_own = len(words) == 3 and words[0].endswith(f".pt.{socket.gethostname()}")
+        with contextlib.suppress(OSError):
+            if is_own and words[1].isdigit():
+                is_over = not _is_running(int(words[1]))
+            else:
+                is_over = time.time() - path.stat().st_mtime > _SECONDS_TO_KEEP
+            if is_over:
+                path.unlink()
+
+
+def _is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        # It is another user's.
+        return True
+    return True
 
 
 def _write(data: Mapping[str, Any], file: io.IOBase) -> None:

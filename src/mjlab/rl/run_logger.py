@@ -6,6 +6,7 @@ import contextlib
 import io
 import logging
 import statistics
+import threading
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -51,6 +52,7 @@ class RunLogger(Logger):
         self._finished: list[tuple[torch.Tensor, ...]] = []
         self._step_rewards: list[torch.Tensor] = []
         self._write_failed = False
+        self._thread_hook = threading.excepthook
 
     @property
     def logger_type(self) -> str | None:
@@ -92,6 +94,9 @@ class RunLogger(Logger):
                 self.cfg["logger"] = wanted
         for line in filter(None, printed.getvalue().splitlines()):
             logger.debug("%s", line)
+        if self.writer is not None:
+            self._thread_hook = threading.excepthook
+            threading.excepthook = self._on_thread_error
 
     def process_env_step(
         self,
@@ -231,8 +236,20 @@ class RunLogger(Logger):
             for tag, value in scalars.items():
                 self.writer.add_scalar(tag, value, step)
         except OSError as error:
+            self._stop_writing(error)
+
+    def _stop_writing(self, error: BaseException | None) -> None:
+        if not self._write_failed:
             self._write_failed = True
             logger.warning("Figures are no longer written to %s: %s", self.log_dir, error)
+
+    def _on_thread_error(self, args: threading.ExceptHookArgs) -> None:
+        # TensorBoard writes in a thread, whose traceback would come before the error that it causes.
+        is_writer = type(args.thread).__module__.startswith("tensorboard.")
+        if is_writer and issubclass(args.exc_type, OSError):
+            self._stop_writing(args.exc_value)
+        else:
+            self._thread_hook(args)
 
     def write_evaluation(
         self, result: EvaluationResult, iteration: int, group: str = "Evaluation"
@@ -252,6 +269,8 @@ class RunLogger(Logger):
     def stop_logging_writer(self) -> None:
         """Flush and close the event file."""
         super().stop_logging_writer()
+        if threading.excepthook == self._on_thread_error:
+            threading.excepthook = self._thread_hook
         close = getattr(self.writer, "close", None)
         if close is None:
             return

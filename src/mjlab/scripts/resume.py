@@ -45,9 +45,8 @@ def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
         _check_pattern(f"--agent.{flag.replace('_', '-')}", getattr(agent, flag))
     matching = _matching(experiment, agent.load_run)
     others = {run.name: why for run in matching if (why := _other_kind(run, task, cfg.learner))}
-    if others:
-        if len(others) == len(matching):
-            raise UserError(_only_others(task, cfg.learner, agent.load_run, experiment, others))
+    if others and len(others) == len(matching):
+        raise UserError(_only_others(task, cfg.learner, agent.load_run, experiment, others))
     for run in matching:
         if run.name not in others:
             with contextlib.suppress(ValueError):

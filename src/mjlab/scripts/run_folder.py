@@ -46,9 +46,10 @@ class NewRunFolder:
         Raises:
             RunFolderError: it cannot be made or written to.
         """
-        from mjlab.rl.checkpoint import ensure_writable_folder
+        from mjlab.rl.checkpoint import ensure_writable_folder, remove_leftovers
 
         ensure_writable_folder(self._experiment)
+        remove_leftovers(self._experiment)
         name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
         if self._run_name:
             name += f"_{self._run_name}"
@@ -163,7 +164,7 @@ def read_run_info(run_dir: Path) -> dict[str, Any]:
     """Return what `run_dir` says about its run; nothing if it says nothing readable."""
     try:
         info = json.loads((run_dir / _INFO_FILE).read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return info if isinstance(info, dict) else {}
 
@@ -183,7 +184,7 @@ def _read_params(path: Path) -> dict[str, Any]:
 
     try:
         params = yaml.safe_load(path.read_text())
-    except (OSError, ValueError, yaml.YAMLError):
+    except (OSError, ValueError, RecursionError, yaml.YAMLError):
         return {}
     return params if isinstance(params, dict) else {}
 

@@ -10,7 +10,14 @@ import sys
 from pathlib import Path
 from types import FrameType
 
-from mjlab.scripts.cli import BadCallError, UserError, is_given, run_command, task_and_flags, task_usage
+from mjlab.scripts.cli import (
+    BadCallError,
+    UserError,
+    is_given,
+    run_command,
+    task_and_flags,
+    task_usage,
+)
 from mjlab.scripts.run_folder import read_run_info, run_folders
 from mjlab.utils.processes import PARENT_VARIABLE
 
