@@ -102,11 +102,16 @@ def test_an_experiment_may_be_a_folder_in_a_folder(attempt, tmp_path):
 def test_a_folder_that_takes_no_more_is_told_without_tracebacks(tmp_path):
     # As on a file system that turned read-only, the event file can no longer be written.
     program = (
-        "import resource, signal\n"
+        "import resource, signal, time\n"
+        "now = time.time\n"
         "from mjlab.scripts import train_run\n"
         "def limit(self, stats):\n"
+        "    if stats.iteration < 3:\n        return\n"
         "    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "    resource.setrlimit(resource.RLIMIT_FSIZE, (16, resource.RLIM_INFINITY))\n"
+        # Event files are written every ten seconds.
+        "    time.time = lambda: now() + 1000.0 * stats.iteration\n"
+        "    time.sleep(0.02)\n"
         "train_run._Beginning.on_iteration = limit\n"
         "from mjlab.scripts.train import main\n"
         "main()\n"
@@ -120,7 +125,7 @@ def test_a_folder_that_takes_no_more_is_told_without_tracebacks(tmp_path):
     assert "Traceback" not in done.stderr
     (run_dir,) = (tmp_path / "cartpole").iterdir()
     assert f"error: The checkpoint '{run_dir}" in done.stderr
-    assert done.stderr.count(f"no longer written to {run_dir}") <= 1
+    assert done.stderr.count(f"no longer written to {run_dir}") == 1
 
 
 def test_leftovers_of_killed_writers_are_removed_and_no_others(tmp_path):
