@@ -39,7 +39,12 @@ def test_added_fields_do_not_shift_positional_arguments():
     assert names[-1] == "evaluation"
     assert RslRlBaseRunnerCfg(1, 2, 3).max_iterations == 3
     kw_only = {f.name for f in fields(RslRlOnPolicyRunnerCfg) if f.kw_only}
-    assert kw_only == {"evaluation", "torch_compile_mode"}
+    assert kw_only == {
+        "evaluation",
+        "save_git_diff",
+        "upload_git_diff",
+        "torch_compile_mode",
+    }
 
 
 def test_configs_do_not_share_their_parts():

@@ -241,6 +241,8 @@ def a_line(**changes) -> str:
         ("x,y,z\n" + a_line(), "is not a table of numbers"),
         ("1,2,3\n4,5,6\n", "has 3 columns, and the robot needs 36"),
         (f"{a_line()}\n{a_line(c8=float('nan'))}", "Line 2 of .* NaN"),
+        (f"{a_line(c8=1e39)}\n{a_line()}", "joint_pos of .* infinite, .* float32"),
+        (f"{a_line(c8=3e38)}\n{a_line(c8=-3e38)}", "joint_vel of .* infinite, .* float32"),
         (f"{a_line()}\n{a_line(c6=0.5)}", "in line 2 the norm is 0.5"),
     ],
 )

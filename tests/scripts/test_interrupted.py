@@ -115,3 +115,29 @@ def read_until_closed(terminal: int) -> None:
     with contextlib.suppress(OSError):
         while os.read(terminal, 4096):
             pass
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_a_signal_while_building_leaves_no_folder(tmp_path, number):
+    # Building takes as long as the signal needs; the folder is there by then.
+    program = (
+        "import os, signal, sys, time\n"
+        "from mjlab.scripts import train_run\n"
+        "def build(*args):\n"
+        f"    os.kill(os.getpid(), {int(number)})\n"
+        "    time.sleep(30)\n"
+        "train_run._build_env = build\n"
+        "from mjlab.scripts.train import main\n"
+        "main()\n"
+    )
+    flags = [TASK, *SMALL, "--log-root", str(tmp_path)]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *flags],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert done.returncode == 128 + number
+    assert "Traceback" not in done.stderr
+    assert list((tmp_path / "cartpole").iterdir()) == []

@@ -87,6 +87,30 @@ def test_a_signal_goes_to_every_process_once_and_all_are_waited_for(tmp_path, na
     assert (tmp_path / "saved_0").read_text() == "x"
 
 
+def test_a_killed_launcher_ends_its_workers(tmp_path):
+    child = (
+        f"{PROGRAM}from mjlab.utils.processes import end_with_launcher\n"
+        f"folder = pathlib.Path({str(tmp_path)!r})\n"
+        "def save(*_):\n    (folder / f'saved_{rank}').touch()\n    os._exit(0)\n"
+        "signal.signal(signal.SIGTERM, save)\nend_with_launcher()\n"
+        "(folder / f'ready_{rank}').touch()\ntime.sleep(30)\n"
+    )
+    parent = (
+        "import sys\nfrom mjlab.scripts.launcher import launch_workers\n"
+        f"launch_workers([sys.executable, '-c', {child!r}], 2)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", parent])
+    deadline = time.monotonic() + 60
+    while len(list(tmp_path.glob("ready_*"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 20
+    while len(list(tmp_path.glob("saved_*"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert len(list(tmp_path.glob("saved_*"))) == 2
+
+
 @pytest.fixture
 def gpus(monkeypatch):
     """Return a function that sets the number of GPUs and what is visible."""

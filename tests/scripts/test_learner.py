@@ -203,6 +203,7 @@ def test_play_and_evaluate_need_not_be_told(run, of_sac, tmp_path):
 
 def test_the_newest_policy_of_a_learner_is_played(run, first, trained):
     newer = shutil.copytree(trained, first.with_name("2026-01-02_00-00-00"))
+    (newer / "model_1.pt").touch()
     common = ("--log-root", str(first.parents[1]), "--device", "cpu")
     for flags, expected in (((), newer), (("--learner", "sac"), first)):
         outcome = run("play", TASK, "--viewer", "none", "--num-steps", "2", *common, *flags)

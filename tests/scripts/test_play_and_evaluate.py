@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
+from types import SimpleNamespace
 
 import onnx
 import pytest
@@ -53,6 +55,19 @@ def test_a_policy_of_weights_and_biases_is_played(run, trained, monkeypatch):
     outcome = run("play", TASK, *HEADLESS, "--wandb-run-path", "me/project/abc")
     assert outcome.status == 0, outcome.err
     assert asked == [("me/project/abc", None)]
+
+
+@pytest.mark.parametrize("script", ["play", "evaluate", "train"])
+def test_weights_and_biases_without_a_login_is_one_error(run, tmp_path, monkeypatch, script):
+    def fail():
+        raise RuntimeError("No API key configured.")
+
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(Api=fail))
+    flags = ["--agent.resume", "True"] if script == "train" else []
+    root = ("--log-root", str(tmp_path), "--device", "cpu")
+    outcome = run(script, TASK, *root, "--wandb-run-path", "me/project/abc", *flags)
+    assert outcome.status == 1
+    assert "No API key configured. Use `wandb login`" in outcome.message
 
 
 def test_a_policy_with_networks_from_the_command_line_is_played(run, train, tmp_path):

@@ -8,6 +8,7 @@ import pytest
 import torch
 import yaml
 
+from mjlab.rl.learners import acting_cfg
 from mjlab.rl.rsl import resolve_callable
 from mjlab.scripts.policy import _agent_cfg, constant_policy
 from mjlab.tasks.registry import load_rl_cfg
@@ -39,9 +40,7 @@ def test_encoders_of_the_run_replace_those_of_the_task(tmp_path):
 
 
 def agent_cfg_of_task():
-    from dataclasses import asdict
-
-    return asdict(load_rl_cfg(TASK))
+    return acting_cfg(load_rl_cfg(TASK))
 
 
 REFERENCE_ACTOR = "mjlab.tasks.tracking.rl.reference_actor:ReferenceActor"

@@ -210,3 +210,25 @@ def test_the_launcher_trains_and_ctrl_c_saves_once(tmp_path):
     )
     flags = [TASK, *SMALL, "--log-root", str(tmp_path), "--agent.max-iterations", "1000000"]
     interrupt_training([sys.executable, "-c", program, *flags], tmp_path, patience=120.0)
+
+
+@pytest.mark.slow
+def test_workers_of_a_killed_launcher_save_and_end(tmp_path):
+    program = (
+        "import sys\n"
+        "from mjlab.scripts.launcher import launch_workers, train_command\n"
+        "launch_workers(train_command(sys.argv[1], sys.argv[2:]), 2)\n"
+    )
+    flags = [TASK, *SMALL, "--log-root", str(tmp_path), "--agent.max-iterations", "1000000"]
+    launcher = subprocess.Popen([sys.executable, "-c", program, *flags])
+    end = time.monotonic() + 120.0
+    while not list(tmp_path.glob("cartpole/*/model_0.pt")) and time.monotonic() < end:
+        time.sleep(0.02)
+    launcher.kill()
+    launcher.wait()
+    (run_dir,) = (tmp_path / "cartpole").iterdir()
+    while "ended" not in read_run_info(run_dir) and time.monotonic() < end:
+        time.sleep(0.02)
+    info = read_run_info(run_dir)
+    assert info["ended"] == "interrupted"
+    assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -19,11 +20,12 @@ from mjlab.scripts.run_folder import (
 TASK = "My-Task"
 
 
-def make_run(experiment: Path, name: str, *numbers: int, **info) -> Path:
+def make_run(experiment: Path, name: str, *numbers: int, changed: float = 1e9, **info) -> Path:
     run_dir = experiment / name
     run_dir.mkdir(parents=True)
     for number in numbers:
         (run_dir / f"model_{number}.pt").write_bytes(b"")
+        os.utime(run_dir / f"model_{number}.pt", (changed, changed))
     if info:
         write_run_info(run_dir, **info)
     return run_dir
@@ -36,14 +38,16 @@ def test_what_a_folder_says_grows_and_the_newest_counts(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
 
 
-@pytest.mark.parametrize("text", [None, "", "{half", "[1, 2]"])
+@pytest.mark.parametrize("text", [None, "", "{half", "[1, 2]", "[" * 10**4, "9" * 5000])
 def test_a_folder_that_says_nothing_readable_says_nothing(tmp_path, text):
     if text is not None:
         (tmp_path / "run.json").write_text(text)
     assert read_run_info(tmp_path) == {}
 
 
-@pytest.mark.parametrize("text", [None, "", "a: [", "just text", "- 1"])
+@pytest.mark.parametrize(
+    "text", [None, "", "a: [", "just text", "- 1", "a: " + "[" * 10**4, "a: " + "9" * 5000]
+)
 def test_unreadable_parameters_are_none(tmp_path, text):
     if text is not None:
         (tmp_path / "params").mkdir()
@@ -69,6 +73,13 @@ def test_the_newest_checkpoint_is_of_the_newest_run_of_the_task_that_has_one(tmp
     assert newest_checkpoint(tmp_path, TASK) == expected / "model_50.pt"
     assert newest_checkpoint(tmp_path, "Third-Task") is None
     assert newest_checkpoint(tmp_path / "nowhere", TASK) is None
+
+
+def test_the_newest_run_is_the_one_with_the_newest_checkpoint(tmp_path):
+    make_run(tmp_path, "2026-01-09", 9)
+    older = make_run(tmp_path, "2026-01-01_long", 1, 2, changed=2e9)
+    assert newest_checkpoint(tmp_path, TASK) == older / "model_2.pt"
+    assert named_checkpoint(tmp_path / "model_1.pt", TASK) == older / "model_1.pt"
 
 
 def test_a_run_that_does_not_name_its_task_may_be_of_this_one(tmp_path):

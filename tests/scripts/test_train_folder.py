@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -108,3 +110,46 @@ def test_an_experiment_may_be_a_folder_in_a_folder(attempt, tmp_path):
     outcome, _ = attempt("--agent.experiment-name", "group/mine", "--agent.run-name", "a..b")
     assert outcome.status == 0, outcome.err
     assert len(list((tmp_path / "logs" / "group" / "mine").glob("*_a..b/model_1.pt"))) == 1
+
+
+def test_a_folder_that_takes_no_more_is_told_without_tracebacks(tmp_path):
+    # As on a file system that turned read-only, the event file can no longer be written.
+    program = (
+        "import resource, signal, time\n"
+        "now = time.time\n"
+        "from mjlab.scripts import train_run\n"
+        "def limit(self, stats):\n"
+        "    if stats.iteration < 3:\n        return\n"
+        "    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "    resource.setrlimit(resource.RLIMIT_FSIZE, (16, resource.RLIM_INFINITY))\n"
+        # Event files are written every ten seconds.
+        "    time.time = lambda: now() + 1000.0 * stats.iteration\n"
+        "    time.sleep(0.02)\n"
+        "train_run._Beginning.on_iteration = limit\n"
+        "from mjlab.scripts.train import main\n"
+        "main()\n"
+    )
+    flags = [TASK, *SMALL, "--log-root", str(tmp_path), "--agent.max-iterations", "60"]
+    flags += ["--agent.save-interval", "1000"]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *flags], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    (run_dir,) = (tmp_path / "cartpole").iterdir()
+    assert f"error: The checkpoint '{run_dir}" in done.stderr
+    assert done.stderr.count(f"no longer written to {run_dir}") == 1
+
+
+def test_a_killed_writer_leaves_what_is_removed(tmp_path):
+    (tmp_path / "old").mkdir()
+    program = (
+        "import os, sys\nfrom mjlab.rl import checkpoint\n"
+        "checkpoint._write = lambda *_: os.kill(os.getpid(), 9)\n"
+        "checkpoint.save_checkpoint({}, sys.argv[1])\n"
+    )
+    path = tmp_path / "old" / "model_1.pt"
+    subprocess.run([sys.executable, "-c", program, str(path)], check=False)
+    assert len(list(path.parent.iterdir())) == 1
+    with NewRunFolder(tmp_path, ""):
+        assert list(path.parent.iterdir()) == []

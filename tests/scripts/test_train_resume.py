@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -115,6 +116,20 @@ def test_a_run_of_another_task_is_refused_and_named(first, resume, flags):
     for part in (first.name, TASK, OTHER):
         assert part in outcome.message
     assert list(first.parent.iterdir()) == [first]
+
+
+def test_the_run_that_was_changed_last_is_resumed(first, resume):
+    # Its clock was wrong, or it was renamed.
+    other = shutil.copytree(first, first.with_name("2099-01-01"))
+    for path in other.glob("model_*.pt"):
+        os.utime(path, (1e9, 1e9))
+    outcome = resume()
+    assert outcome.status == 0, outcome.err
+    assert f"Resumed: {first / 'model_1.pt'}" in outcome.out
+    # A name that is given wins, and so does a checkpoint that only one of them has.
+    shutil.copy2(other / "model_0.pt", other / "model_7.pt")
+    outcome = resume("--agent.load-checkpoint", "model_7.pt", iterations=1)
+    assert f"{other / 'model_7.pt'} has finished" in outcome.out
 
 
 @pytest.mark.parametrize("flag", ["--agent.load-run", "--agent.load-checkpoint"])

@@ -183,6 +183,13 @@ def test_an_interrupted_run_is_kept_and_goes_on(verify, tmp_path, monkeypatch):
     assert resumed.status == 0, resumed.err
     newest = max((tmp_path / "logs" / "cartpole").iterdir())
     figures = read_run(newest).figures
+    # An earlier session that is gone is a bad call, not a curve that is outside.
+    first = min((tmp_path / "logs" / "cartpole").iterdir())
+    first.rename(tmp_path / "away")
+    lost = verify("--seed", "5", "--resume")
+    assert lost.status == 2
+    assert "earlier session" in lost.message
+    (tmp_path / "away").rename(first)
     # A finished run is compared again, without training.
     again = verify("--seed", "5", "--resume", edit=raise_returns)
     assert again.status == 1

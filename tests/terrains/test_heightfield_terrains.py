@@ -350,6 +350,7 @@ def test_colours_follow_height_on_one_scale():
         (obstacles(obstacle_height_mode="tall"), "'tall'; it must be 'choice' or 'fixed'"),
         (wave(num_waves=39), "num_waves is 39; 76 pixels along y can show at most 38"),
         (perlin(scale=300.0), "scale is 300.0; that makes 150 hills along each side, but 140"),
+        (rough(horizontal_scale=1e-320), "horizontal_scale is 1e-320; expected at most"),
         (rough(horizontal_scale=1e-3), "horizontal_scale is 0.001; that makes 64,000,000 pixels"),
         (perlin(octaves=0), "octaves is 0; it must be at least 1"),
         (perlin(scale=0.0), "scale is 0.0; it must be above 0"),
@@ -364,3 +365,9 @@ def test_colours_follow_height_on_one_scale():
 def test_what_cannot_be_built_is_refused_by_name(cfg, message):
     with pytest.raises(ValueError, match=message):
         build(cfg)
+
+
+def test_fields_beyond_the_memory_are_refused_with_an_estimate(monkeypatch):
+    monkeypatch.setattr("mjlab.terrains._heightfield.available_memory", lambda device: 70_000)
+    with pytest.raises(ValueError, match=r"expected at most 5,000 pixels.*got 6,400"):
+        build(rough())

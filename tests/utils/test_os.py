@@ -210,6 +210,19 @@ def wandb_files(monkeypatch):
     return files
 
 
+class UsageError(Exception):
+    """As wandb calls it."""
+
+
+def test_what_wandb_raises_is_one_error_with_what_to_do(tmp_path, monkeypatch):
+    def fail():
+        raise UsageError("No API key configured. Use `wandb login` to log in.\nTraceback: ...")
+
+    monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(Api=fail))
+    with pytest.raises(OSError, match=r"'me/project/abc' .*No API key configured.*wandb login"):
+        get_wandb_checkpoint_path(tmp_path, Path("me/project/abc"))
+
+
 def test_the_highest_wandb_checkpoint_is_downloaded_once(tmp_path, wandb_files):
     path, was_cached = get_wandb_checkpoint_path(tmp_path, Path("me/project/abc"))
     assert (path, was_cached) == (tmp_path / "wandb_checkpoints" / "abc" / "model_400.pt", False)

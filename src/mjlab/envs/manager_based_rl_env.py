@@ -36,6 +36,7 @@ from mjlab.managers.debug_vis import SensorSwitches
 from mjlab.managers.lookup import Lookup, look_up
 from mjlab.scene import Scene
 from mjlab.sim.engine import resolve_engine_name
+from mjlab.sim.memory import LEAST_BYTES, check_memory
 from mjlab.sim.simulation import Simulation
 from mjlab.utils import spaces
 from mjlab.utils.random import draw_seed, seed_rng
@@ -88,6 +89,8 @@ class ManagerBasedRlEnv:
         self.extras: dict[str, Any] = {}
         self.obs_buf: VecEnvObs = {}
         self._device = device
+        # Origins are made with the scene, before the sizes of the model are known.
+        check_memory(cfg.scene.num_envs, LEAST_BYTES, device)
         self.scene = Scene(cfg.scene, device=device)
         self.sim = self._create_simulation()
         self.scene.initialize(self.sim.mj_model, self.sim.model, self.sim.data)

@@ -8,8 +8,12 @@ all processes hold the same networks after every update. The first process alone
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
+import threading
+import time
 from collections.abc import Callable, Generator
+from datetime import timedelta
 from typing import TypeVar
 
 import torch
@@ -20,6 +24,12 @@ T = TypeVar("T")
 
 # Set by our launcher, as host:port; torchrun announces its store by MASTER_ADDR and MASTER_PORT.
 STORE_VARIABLE = "MJLAB_PROCESS_STORE"
+
+logger = logging.getLogger(__name__)
+
+# Seconds after which a process says for whom it waits, and after which it gives up, as torch does.
+_SECONDS_OF_SILENCE = 5.0
+_SECONDS_TO_JOIN = 1800.0
 
 
 class OtherProcessError(RuntimeError):
@@ -34,6 +44,8 @@ def join_processes(device: str) -> bool:
 
     Raises:
         ValueError: the environment variables of the launcher are contradictory.
+        OSError: the address that they name cannot be listened on.
+        TimeoutError: not all processes have come within half an hour.
     """
     rank = process_rank()
     if rank.is_alone or torch.distributed.is_initialized():
@@ -42,16 +54,68 @@ def join_processes(device: str) -> bool:
     if torch.device(device).type == "cuda":
         backend = "cpu:gloo,cuda:nccl"
         torch.cuda.set_device(torch.device(device))
-    address = os.environ.get(STORE_VARIABLE)
-    if address is None:
+    if os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True":
+        # torchrun starts them all, and ends them where one is missing.
         torch.distributed.init_process_group(backend)
         return True
-    host, _, port = address.rpartition(":")
-    store = torch.distributed.TCPStore(host, int(port), rank.world_size, is_master=False)
     torch.distributed.init_process_group(
-        backend, store=store, rank=rank.rank, world_size=rank.world_size
+        backend, store=_store_with_all(rank), rank=rank.rank, world_size=rank.world_size
     )
     return True
+
+
+def _store_with_all(rank: ProcessRank) -> torch.distributed.Store:
+    """Return the store in which processes find each other, once all of them have come."""
+    address = os.environ.get(STORE_VARIABLE)
+    host, port = os.environ.get("MASTER_ADDR"), os.environ.get("MASTER_PORT")
+    if address is not None:
+        host, _, port = address.rpartition(":")
+    if not host or port is None or not port.isdigit():
+        raise ValueError(
+            f"WORLD_SIZE={rank.world_size}: expected MASTER_ADDR and MASTER_PORT, where processes find "
+            f"each other, got {host!r} and {port!r}; use torchrun, or unset WORLD_SIZE."
+        )
+    hosts = rank.is_first and address is None
+    begin, where = time.monotonic(), f"{host}:{port}"
+    names = f"Process {rank.rank} of {rank.world_size}"
+    hint = "WORLD_SIZE says how many there are; unset it to train in one process."
+    # Looking for a store that is not there does not return.
+    timer = threading.Timer(
+        _SECONDS_OF_SILENCE,
+        lambda: logger.warning("%s waits for process 0 at %s. %s", names, where, hint),
+    )
+    timer.daemon = True
+    timer.start()
+    try:
+        store = torch.distributed.TCPStore(
+            host,
+            int(port),
+            rank.world_size,
+            is_master=hosts,
+            timeout=timedelta(seconds=_SECONDS_TO_JOIN),
+            wait_for_workers=False,
+        )
+    except torch.distributed.DistError as error:
+        if hosts:
+            raise OSError(
+                f"MASTER_ADDR, MASTER_PORT: expected an address that {names} can listen on, got "
+                f"{where}; use another port."
+            ) from error
+        raise TimeoutError(f"{names} found no process 0 at {where}. {hint}") from error
+    finally:
+        timer.cancel()
+    come, told = store.add("mjlab/come", 1), False
+    while come < rank.world_size:
+        waited = time.monotonic() - begin
+        progress = f"at {where}: {come} of {rank.world_size} have come"
+        if waited > _SECONDS_TO_JOIN:
+            raise TimeoutError(f"{names} waited {waited:.0f} s for the others {progress}. {hint}")
+        if waited > _SECONDS_OF_SILENCE and not told:
+            logger.warning("%s waits for the others %s. %s", names, progress, hint)
+            told = True
+        time.sleep(0.05)
+        come = store.add("mjlab/come", 0)
+    return store
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from mjlab.rl.rsl import CNN, CNNModel, MLPModel, TensorDict, resolve_callable
+from mjlab.rl.rsl import CNN, PPO, CNNModel, MLPModel, TensorDict, resolve_callable
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
 
 _MODELS = ("actor", "critic", "student", "teacher")
@@ -46,6 +46,27 @@ def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
             images[model] = _check_model(observations, cfg, model, shared)
     if shared:
         _check_sharing(images)
+
+
+def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:
+    """Raise ValueError if PPO's mini-batches would be empty: the loss is NaN, or nothing is learned."""
+    algorithm = cfg["algorithm"]
+    kind = resolve_callable(algorithm["class_name"])
+    if not (isinstance(kind, type) and issubclass(kind, PPO)):
+        return
+    # rsl_rl keeps the steps of an environment together for networks that remember them.
+    kinds = [resolve_callable(cfg[model]["class_name"]) for model in ("actor", "critic")]
+    is_recurrent = any(getattr(kind, "is_recurrent", False) for kind in kinds)
+    steps = cfg["num_steps_per_env"]
+    most = num_envs if is_recurrent else num_envs * steps
+    parts = algorithm.get("num_mini_batches", 1)
+    if not 1 <= parts <= most:
+        of = f"{num_envs} environments" + ("" if is_recurrent else f" times {steps} steps")
+        why = ", which recurrent networks learn from as a whole" if is_recurrent else ""
+        raise ValueError(
+            f"agent.algorithm num_mini_batches: expected 1 to {most} ({of}{why}), got {parts}; use "
+            "fewer mini-batches, or more environments."
+        )
 
 
 def _check_sac_models(observations: TensorDict, cfg: Mapping[str, Any]) -> None:

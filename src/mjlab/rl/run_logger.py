@@ -7,6 +7,7 @@ import io
 import logging
 import os
 import statistics
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,6 +57,7 @@ class RunLogger(Logger):
         self._finished: list[tuple[torch.Tensor, ...]] = []
         self._step_rewards: list[torch.Tensor] = []
         self._write_failed = False
+        self._thread_hook = threading.excepthook
 
     @property
     def logger_type(self) -> str | None:
@@ -102,6 +104,9 @@ class RunLogger(Logger):
             self._keep_code_state(Path(self.log_dir))
         for line in filter(None, printed.getvalue().splitlines()):
             logger.debug("%s", line)
+        if self.writer is not None:
+            self._thread_hook = threading.excepthook
+            threading.excepthook = self._on_thread_error
 
     def _keep_code_state(self, run_dir: Path) -> None:
         if self.cfg.get("save_git_diff", True):
@@ -252,8 +257,20 @@ class RunLogger(Logger):
             for tag, value in scalars.items():
                 self.writer.add_scalar(tag, value, step)
         except OSError as error:
+            self._stop_writing(error)
+
+    def _stop_writing(self, error: BaseException | None) -> None:
+        if not self._write_failed:
             self._write_failed = True
             logger.warning("Figures are no longer written to %s: %s", self.log_dir, error)
+
+    def _on_thread_error(self, args: threading.ExceptHookArgs) -> None:
+        # TensorBoard writes in a thread, whose traceback would come before the error that it causes.
+        is_writer = type(args.thread).__module__.startswith("tensorboard.")
+        if is_writer and issubclass(args.exc_type, OSError):
+            self._stop_writing(args.exc_value)
+        else:
+            self._thread_hook(args)
 
     def write_evaluation(
         self, result: EvaluationResult, iteration: int, group: str = "Evaluation"
@@ -273,6 +290,8 @@ class RunLogger(Logger):
     def stop_logging_writer(self) -> None:
         """Flush and close the event file."""
         super().stop_logging_writer()
+        if threading.excepthook == self._on_thread_error:
+            threading.excepthook = self._thread_hook
         close = getattr(self.writer, "close", None)
         if close is None:
             return

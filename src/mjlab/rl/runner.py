@@ -38,7 +38,7 @@ from mjlab.rl.image_encoders import (
     train_once,
 )
 from mjlab.rl.migration import check_finite, check_fits, check_optimizer_fits, migrate
-from mjlab.rl.network_checks import check_networks
+from mjlab.rl.network_checks import check_mini_batches, check_networks
 from mjlab.rl.onnx_export import export_to_onnx
 from mjlab.rl.progress import IterationStats, TrainingObserver
 from mjlab.rl.replay import ReplayFiles, ReplayStorage
@@ -161,14 +161,16 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             CheckpointError: a checkpoint could not be written.
             DivergedError: the physics diverged in most environments, or training failed because of it.
             BrokenTermError: a reward or a termination stayed NaN in every environment.
-            ValueError: the environment returned NaN, Weights & Biases started no run, or a student has
-                no teacher.
+            ValueError: the environment returned NaN, Weights & Biases started no run, a student has no
+                teacher, or there are more mini-batches than samples.
         """
         if not getattr(self.alg, "teacher_loaded", True):
             raise ValueError(
                 "Distillation: expected a teacher, got none; give its checkpoint by "
                 "--agent.teacher-checkpoint, or call load_teacher."
             )
+        # Not when the runner is built, which playing does in any number of environments.
+        check_mini_batches(self.env.num_envs, self.cfg)
         first = self.current_learning_iteration
         if self._writes and self.logger.log_dir is not None:
             ensure_writable_folder(self.logger.log_dir)

@@ -39,6 +39,12 @@ class UserError(Exception):
     """Exit status of the command."""
 
 
+class BadCallError(UserError):
+    """A mistake in the command line itself, found before anything is built."""
+
+    exit_status = 2
+
+
 def run_command(command: Callable[[list[str]], None]) -> NoReturn:
     """Run `command` with the command line's arguments and exit.
 

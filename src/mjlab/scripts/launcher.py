@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from types import FrameType
 
 from mjlab.scripts.cli import OTHER_PROCESS_STATUS, UserError
-from mjlab.utils.processes import cores_per_process
+from mjlab.utils.processes import PARENT_VARIABLE, cores_per_process
 
 # What ends the launcher, and what the processes get for it: they save at the first two.
 _FORWARDED: dict[int, signal.Signals] = {
@@ -49,6 +49,7 @@ def launch_workers(
     # be taken by others in between.
     store = torch.distributed.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
     shared = {**os.environ, **(environment or {}), STORE_VARIABLE: f"127.0.0.1:{store.port}"}
+    shared[PARENT_VARIABLE] = str(os.getpid())
     shared.setdefault("OMP_NUM_THREADS", str(max(1, cores_per_process() // count)))
     numbers = {"WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count)}
     workers: list[subprocess.Popen[bytes]] = []

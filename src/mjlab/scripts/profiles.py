@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from mjlab.scripts.cli import parse_flags, parse_known_flags, tell
 from mjlab.scripts.run_folder import read_run_info
-from mjlab.tasks.registry import list_profiles
+from mjlab.tasks.registry import list_profiles, load_rl_cfg
 
 C = TypeVar("C")
 
@@ -88,4 +88,19 @@ def suggest_profile(task: str, profile: str | None, device: str) -> None:
         tell(
             f"Training on the CPU: `train {task} --profile {CPU_PROFILE}` has settings for a "
             "few cores."
+        )
+
+
+def tell_foreign_learner(task: str, profile: str | None, learner: str) -> None:
+    """Say in one line that a profile has no settings for a learner, if it has those of another."""
+    from mjlab.rl.learners import learner_of
+
+    # A student is made like the profile's teacher.
+    if profile is None or learner == "distillation":
+        return
+    tuned = learner_of(load_rl_cfg(task, profile=profile))
+    if tuned != learner:
+        tell(
+            f"The profile {profile!r} of {task} has settings for the learner {tuned!r}: its environment "
+            f"is used, while networks, algorithm and iterations of {learner!r} are those without it."
         )

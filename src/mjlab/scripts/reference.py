@@ -160,7 +160,7 @@ class Reference:
                 seed["run"] = RunRecord(**seed["run"])
             content["seeds"] = [SeedRecord(**seed) for seed in content["seeds"]]
             return cls(**content)
-        except (OSError, ValueError, TypeError, KeyError) as error:
+        except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             raise UserError(
                 f"{path}: expected a reference, as `make reference` writes it, got {error!r}."
             ) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from collections.abc import Mapping
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
 def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
     """Return the checkpoint that `cfg` asks to go on from, or None if it asks for a new run.
 
-    It is the newest one of the newest run of `task`, by the learner that `cfg` names, that the
-    patterns let through. Runs that do not name their task count as runs of any task; those that do
+    It is the one with the highest number in the run of `task`, by the learner that `cfg` names, that
+    was changed last, of those that the patterns let through. Runs that do not name their task count as runs of any task; those that do
     not name their learner, as runs of any learner.
 
     Raises:
@@ -42,15 +43,17 @@ def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
         return get_wandb_checkpoint_path(experiment, run_path, cfg.wandb_checkpoint_name)[0]
     for flag in ("load_run", "load_checkpoint"):
         _check_pattern(f"--agent.{flag.replace('_', '-')}", getattr(agent, flag))
-    pattern = agent.load_run
-    matching = _matching(experiment, pattern)
+    matching = _matching(experiment, agent.load_run)
     others = {run.name: why for run in matching if (why := _other_kind(run, task, cfg.learner))}
-    if others:
-        if len(others) == len(matching):
-            raise UserError(_only_others(task, cfg.learner, agent.load_run, experiment, others))
-        own = (re.escape(run.name) for run in matching if run.name not in others)
-        pattern = "|".join(own)
-    return get_checkpoint_path(experiment, pattern, agent.load_checkpoint)
+    if others and len(others) == len(matching):
+        raise UserError(_only_others(task, cfg.learner, agent.load_run, experiment, others))
+    for run in matching:
+        if run.name not in others:
+            with contextlib.suppress(ValueError):
+                return get_checkpoint_path(experiment, re.escape(run.name), agent.load_checkpoint)
+    own = "|".join(re.escape(run.name) for run in matching if run.name not in others)
+    # Raises an error that says what there is.
+    return get_checkpoint_path(experiment, own or agent.load_run, agent.load_checkpoint)
 
 
 def choices_to_resume(
@@ -183,7 +186,7 @@ def _check_pattern(flag: str, pattern: str) -> None:
 
 
 def _matching(experiment: Path, pattern: str) -> list[Path]:
-    """Return the runs that `pattern` means, by the rule of `get_checkpoint_path`."""
+    """Return the runs that `pattern` means by the rule of `get_checkpoint_path`, newest first."""
     runs = run_folders(experiment)
     exact = [run for run in runs if re.fullmatch(pattern, run.name)]
     return exact or [run for run in runs if re.match(pattern, run.name)]

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import re
 import shutil
+import signal
+import threading
+from collections.abc import Callable, Generator
 from datetime import datetime
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from mjlab.scripts.cli import UserError, tell
@@ -26,13 +32,14 @@ class NewRunFolder:
     def __init__(self, experiment: Path, run_name: str) -> None:
         self._experiment = experiment
         self._run_name = run_name
-        self._kept = False
+        self.is_kept = False
+        """True once the run has begun."""
         self.path = experiment
         """The folder; it is there once the context is entered."""
 
     def keep(self) -> None:
         """Leave the folder where it is: the run has begun."""
-        self._kept = True
+        self.is_kept = True
 
     def __enter__(self) -> NewRunFolder:
         """Make the folder.
@@ -62,8 +69,42 @@ class NewRunFolder:
 
     def __exit__(self, *exception: object) -> None:
         # A checkpoint is worth more than tidiness, whoever wrote it.
-        if not self._kept and not checkpoints_in(self.path):
+        if not self.is_kept and not checkpoints_in(self.path):
             shutil.rmtree(self.path, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def exit_by_signal(unless: Callable[[], bool]) -> Generator[None]:
+    """Let SIGTERM and SIGHUP leave the block by SystemExit, so that it is cleaned up behind them.
+
+    Where `unless` returns True they do what they always did. Those that are handled or ignored
+    already are left alone, and so are all outside the main thread.
+    """
+    replaced: list[int] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        restore()
+        if unless():
+            os.kill(os.getpid(), number)
+            return
+        tell(f"{signal.Signals(number).name}: stopped before the first iteration.")
+        raise SystemExit(128 + number)
+
+    def restore() -> None:
+        while replaced:
+            if signal.getsignal(number := replaced.pop()) is handle:
+                signal.signal(number, signal.SIG_DFL)
+
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)
+            if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+                signal.signal(number, handle)
+                replaced.append(number)
+    try:
+        yield
+    finally:
+        restore()
 
 
 class SharedRunFolder:
@@ -127,7 +168,7 @@ def read_run_info(run_dir: Path) -> dict[str, Any]:
     """Return what `run_dir` says about its run; nothing if it says nothing readable."""
     try:
         info = json.loads((run_dir / _INFO_FILE).read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return info if isinstance(info, dict) else {}
 
@@ -147,7 +188,7 @@ def _read_params(path: Path) -> dict[str, Any]:
 
     try:
         params = yaml.safe_load(path.read_text())
-    except (OSError, ValueError, yaml.YAMLError):
+    except (OSError, ValueError, RecursionError, yaml.YAMLError):
         return {}
     return params if isinstance(params, dict) else {}
 
@@ -202,10 +243,18 @@ def named_checkpoint(path: Path, task: str) -> Path:
 
 
 def run_folders(experiment: Path) -> list[Path]:
-    """Return the run folders of an experiment, newest first (their names begin with the time)."""
+    """Return the run folders of an experiment, the one whose checkpoints were changed last first.
+
+    Names, which begin with the time of the start, decide between equals and without checkpoints.
+    """
     if not experiment.is_dir():
         return []
-    return sorted((path for path in experiment.iterdir() if path.is_dir()), reverse=True)
+    runs = [path for path in experiment.iterdir() if path.is_dir()]
+    return sorted(runs, key=lambda run: (_last_change(run), run.name), reverse=True)
+
+
+def _last_change(run_dir: Path) -> int:
+    return max((path.stat().st_mtime_ns for path in checkpoints_in(run_dir)), default=0)
 
 
 def _missing(path: Path, task: str) -> str:

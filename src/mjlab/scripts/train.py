@@ -35,16 +35,17 @@ def __getattr__(name: str) -> Any:
 
 def _command(argv: list[str]) -> None:
     task, flags = task_and_flags(argv, _USAGE)
+    from mjlab.scripts.train_checks import check_flags, check_typed_flags
     from mjlab.scripts.train_run import launch_training, parse_train_flags
     from mjlab.scripts.training_device import gpus_to_share
 
     cfg = parse_train_flags(task, flags, prog=f"train {task}")
+    check_typed_flags(cfg, flags)
     gpus = gpus_to_share(cfg)
     if not gpus:
         launch_training(task, cfg)
         return
     from mjlab.scripts.launcher import launch_workers, train_command
-    from mjlab.scripts.train_checks import check_flags
 
     check_flags(cfg)
     # Of the GPUs that they see, the processes use all.

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjlab.scripts.cli import UserError
+from mjlab.scripts.cli import BadCallError, UserError, is_given
+from mjlab.utils.gpu import select_gpus
+from mjlab.utils.processes import process_rank
 from mjlab.viewer.page_server import check_address
 
 if TYPE_CHECKING:
@@ -32,6 +35,42 @@ def check_flags(cfg: TrainConfig) -> None:
     _check_names(cfg)
 
 
+def check_typed_flags(cfg: TrainConfig, flags: list[str]) -> None:
+    """Raise BadCallError for a flag of the command line `flags` that would be ignored."""
+    for flag in ("--wandb-run-path", "--agent.load-run", "--agent.load-checkpoint"):
+        if is_given(flag, flags) and not cfg.agent.resume:
+            raise BadCallError(
+                f"{flag}: expected a run to resume, got a new one; use --agent.resume True with it."
+            )
+    if is_given("--wandb-checkpoint-name", flags) and cfg.wandb_run_path is None:
+        raise BadCallError(
+            "--wandb-checkpoint-name: expected a run at Weights & Biases, got none; use "
+            "--wandb-run-path with it."
+        )
+    if is_given("--gpu-ids", flags) and cfg.gpu_ids is not None:
+        _check_gpus_are_used(cfg)
+    # Networks and algorithms are chosen by their class names, and the runner by the task.
+    kinds = {field.name: field.default for field in dataclasses.fields(cfg.agent)}
+    name = getattr(cfg.agent, "class_name", None)
+    if is_given("--agent.class-name", flags) and name != kinds["class_name"]:
+        raise BadCallError(
+            f"--agent.class-name: expected {kinds['class_name']!r}, got {name!r}, which nothing reads; "
+            "use runner_cls of register_mjlab_task for a runner, or --learner."
+        )
+
+
+def _check_gpus_are_used(cfg: TrainConfig) -> None:
+    if cfg.device is not None and (process_rank().is_alone or not cfg.device.startswith("cuda")):
+        raise BadCallError(
+            f"--gpu-ids: expected no --device beside it, got {cfg.device!r}; leave out one of them."
+        )
+    if select_gpus(cfg.gpu_ids) == (None, 0):
+        raise BadCallError(
+            f"--gpu-ids: expected a GPU, got {cfg.gpu_ids} where none is visible; leave it out to "
+            "train on the CPU."
+        )
+
+
 def _check_numbers(cfg: TrainConfig) -> None:
     """Refuse counts that could only fail once training runs; the environment checks its own."""
     agent: Any = cfg.agent
@@ -45,6 +84,12 @@ def _check_numbers(cfg: TrainConfig) -> None:
         raise UserError(
             f"--agent.algorithm.gradient-length: expected at most {steps}, the steps of an iteration "
             f"times its epochs, got {gradient_length}; with it nothing is learned."
+        )
+    learning_starts = getattr(agent.algorithm, "learning_starts", 0)
+    if learning_starts > (total := agent.num_steps_per_env * agent.max_iterations):
+        raise UserError(
+            f"--agent.algorithm.learning-starts: expected at most {total}, the environment steps of "
+            f"the run, got {learning_starts}; with it nothing is learned."
         )
     counts |= {"--video-length": cfg.video_length, "--video-interval": cfg.video_interval}
     for flag, value in counts.items():

@@ -16,7 +16,7 @@ from mjlab.rl.learners import Learner, learner_of
 from mjlab.rl.progress import TrainingObserver
 from mjlab.scripts.policy import prepare_teacher
 from mjlab.scripts.process_output import ProcessOutput, log_file, output_of
-from mjlab.scripts.profiles import parse_with_choices, suggest_profile
+from mjlab.scripts.profiles import parse_with_choices, suggest_profile, tell_foreign_learner
 from mjlab.scripts.resume import (
     check_learner_resumes,
     checkpoint_to_resume,
@@ -28,6 +28,7 @@ from mjlab.scripts.resume import (
 from mjlab.scripts.run_folder import (
     NewRunFolder,
     SharedRunFolder,
+    exit_by_signal,
     write_resumed,
     write_run_info,
 )
@@ -35,7 +36,12 @@ from mjlab.scripts.task_options import options_of, prepare_env_cfg, with_task_op
 from mjlab.scripts.train_checks import check_flags
 from mjlab.scripts.training_device import training_device
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls, task_source
-from mjlab.utils.processes import ProcessRank, cores_per_process, process_rank
+from mjlab.utils.processes import (
+    ProcessRank,
+    cores_per_process,
+    end_with_launcher,
+    process_rank,
+)
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -139,14 +145,16 @@ def launch_training(task: str, cfg: TrainConfig) -> Path:
     from mjlab.rl.distributed import joined_processes, same_fate
     from mjlab.utils.torch import prepare_torch
 
+    end_with_launcher()
     rank = process_rank()
-    with output_of(rank) as output:
+    # Of all processes, the first alone says which device there is. All say for whom they wait.
+    with output_of(rank):
         device = training_device(cfg, rank)
+    with joined_processes(device), output_of(rank) as output:
         prepare_torch(device)
-        with joined_processes(device):
-            with same_fate():
-                check_flags(cfg)
-            return _train(task, cfg, device, rank, output)
+        with same_fate():
+            check_flags(cfg)
+        return _train(task, cfg, device, rank, output)
 
 
 def _train(
@@ -164,6 +172,8 @@ def _train(
         keep_number_of_environments(task, cfg, checkpoint)
     else:
         suggest_profile(task, cfg.profile, device)
+        if rank.is_first:
+            tell_foreign_learner(task, cfg.profile, learner_of(cfg.agent))
     with same_fate():
         prepare_teacher(task, cfg.agent, checkpoint)
     with _run_folder(cfg, rank, output) as folder:
@@ -227,6 +237,7 @@ def _run_folder(
     experiment = Path(cfg.log_root).resolve() / cfg.agent.experiment_name
     with contextlib.ExitStack() as stack:
         new = NewRunFolder(experiment, cfg.agent.run_name)
+        stack.enter_context(exit_by_signal(unless=lambda: new.is_kept))
         path = from_first(lambda: stack.enter_context(new).path)
         if output is not None:
             output.keep_in(log_file(rank, cfg.torchrunx_log_dir, path))

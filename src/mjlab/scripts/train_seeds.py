@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import subprocess
@@ -9,8 +10,16 @@ import sys
 from pathlib import Path
 from types import FrameType
 
-from mjlab.scripts.cli import UserError, run_command, task_and_flags, task_usage
+from mjlab.scripts.cli import (
+    BadCallError,
+    UserError,
+    is_given,
+    run_command,
+    task_and_flags,
+    task_usage,
+)
 from mjlab.scripts.run_folder import read_run_info, run_folders
+from mjlab.utils.processes import PARENT_VARIABLE
 
 # Signals that end this process, and what the training process gets for each: it handles the first
 # two by saving, while SIGHUP (the terminal was closed) would lose what was learned.
@@ -73,9 +82,17 @@ def _take_count(flags: list[str]) -> tuple[int, list[str]]:
 
 def _experiment(task: str, flags: list[str]) -> Path:
     """Return the folder that the runs go to. Mistaken flags end the command here, `--help` too."""
+    from mjlab.scripts.train_checks import check_typed_flags
     from mjlab.scripts.train_run import parse_train_flags
 
     cfg = parse_train_flags(task, flags, prog=f"train-seeds {task}")
+    check_typed_flags(cfg, flags)
+    for flag in ("--agent.seed", "--agent.run-name"):
+        if is_given(flag, flags):
+            raise BadCallError(
+                f"{flag}: expected none, because each run is named by its seed, 1, 2, ..., got one; "
+                "use --seeds N for their number, or `train` for one run."
+            )
     return Path(cfg.log_root).resolve() / cfg.agent.experiment_name
 
 
@@ -112,7 +129,11 @@ def run_forwarding_signals(command: list[str], seconds: float | None = None) -> 
     try:
         # A session of its own, because a terminal sends Ctrl-C to all processes of its session,
         # and a second signal tells training to stop at once.
-        child = subprocess.Popen(command, start_new_session=True)
+        child = subprocess.Popen(
+            command,
+            env={**os.environ, PARENT_VARIABLE: str(os.getpid())},
+            start_new_session=True,
+        )
         for number in early:
             forward(number)
         try:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mjlab.scripts.cli import (
+    BadCallError,
     UserError,
     parse_flags,
     resolve_device,
@@ -32,7 +33,7 @@ from mjlab.scripts.reference import (
     referenced_tasks,
     samples_limit,
 )
-from mjlab.scripts.run_folder import read_run_info, run_folders
+from mjlab.scripts.run_folder import read_run_info, run_folders, sessions_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,7 +49,7 @@ _USAGE = task_usage(
         "verify Mjlab-Velocity-Flat-Unitree-Go1 --device cpu --seed 1",
     ],
 )
-_OUTSIDE, _BAD_CALL = 1, 2
+_OUTSIDE = 1
 # Rows of the printed table.
 _ROWS = 5
 
@@ -68,12 +69,6 @@ class VerifyConfig:
     """Go on with the newest `verify` run of this task and seed, which was interrupted."""
     log_root: str = "logs/rsl_rl"
     """Folder of all runs."""
-
-
-class BadCallError(UserError):
-    """A mistake in the command line, found before training."""
-
-    exit_status = _BAD_CALL
 
 
 def load_reference(task: str, cfg: VerifyConfig) -> Reference:
@@ -127,6 +122,8 @@ def _prepare(argv: list[str]) -> tuple[str, VerifyConfig, Reference, TrainConfig
     done = None
     if cfg.resume:
         run_dir = _newest_run(task, cfg)
+        # A session that is gone would be missed after training only.
+        sessions_of(run_dir)
         train_flags += ["--agent.resume", "True", "--agent.load-run", re.escape(run_dir.name)]
         done = run_dir if end_of(run_dir) in ENDED else None
     return task, cfg, reference, parse_train_flags(task, train_flags, f"verify {task}"), done
@@ -157,12 +154,17 @@ def _newest_run(task: str, cfg: VerifyConfig) -> Path:
 
 def report(reference: Reference, run: RunRecord, comparison: Comparison) -> str:
     """Return the comparison as text."""
-    newest = reference.seeds[-1]
-    versions = ", ".join(f"{name} {value}" for name, value in newest.versions.items())
+    versions, machines, commits = (
+        "; ".join(dict.fromkeys(texts))
+        for texts in (
+            (", ".join(f"{n} {v}" for n, v in seed.versions.items()) for seed in reference.seeds),
+            (_machine(seed.machine) for seed in reference.seeds),
+            (seed.commit for seed in reference.seeds),
+        )
+    )
     speeds = [seed.run.steps_per_second for seed in reference.seeds]
     lines = [
-        f"Reference  {len(reference.seeds)} seeds on {_machine(newest.machine)}, commit "
-        f"{newest.commit}, {versions}",
+        f"Reference  {len(reference.seeds)} seeds on {machines}, commit {commits}, {versions}",
         f"Speed      {run.steps_per_second:,.0f} steps/s (collecting and learning); reference "
         f"{min(speeds):,.0f} to {max(speeds):,.0f}",
         "",

@@ -26,6 +26,7 @@ from mjlab.sim.engine import (
     create_engine,
     resolve_engine_name,
 )
+from mjlab.sim.memory import bytes_per_environment, check_memory
 from mjlab.sim.randomization import RecomputeLevel, VariantInfo, VariantValues, is_structure
 from mjlab.sim.sim_data import FieldView
 from mjlab.sim.warning_log import collect_mujoco_warnings
@@ -122,7 +123,7 @@ class Simulation:
         in each environment; the model has to be compiled from the spec that they are in.
 
         Raises:
-            ValueError: `num_envs` below 1, neither or both of model and spec, unknown options, or
+            ValueError: `num_envs` below 1 or beyond the memory, neither or both of model and spec, unknown options, or
                 an XML that does not compile (MuJoCo's message is passed on), or variants that
                 differ in what the engine cannot hold per environment.
             EngineUnavailableError: the chosen engine cannot run on `device`.
@@ -139,6 +140,7 @@ class Simulation:
         self.mj_model: mujoco.MjModel = compile_spec(spec) if spec is not None else model
         """The compiled model on the host. Randomized values are not in it."""
         cfg.mujoco.apply(self.mj_model)
+        check_memory(num_envs, bytes_per_environment(self.mj_model, cfg, engine_name), device)
         self.mj_data = mujoco.MjData(self.mj_model)
         """Host data of the compiled model, forwarded once at `qpos0`."""
         mujoco.mj_forward(self.mj_model, self.mj_data)

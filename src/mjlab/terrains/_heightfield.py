@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjlab.sim.memory import available_memory
 from mjlab.terrains._fields import refuse_unless, refuse_unless_positive
 from mjlab.terrains._flat_patches import check_flat_patch, find_flat_patches_from_heightfield
 from mjlab.terrains._height_texture import color_by_height
@@ -20,6 +21,8 @@ MIN_BASE_THICKNESS = 0.5
 SPAWN_RADIUS = 1.0
 # A mistyped pixel size should be told, rather than fill the memory.
 _MAX_PIXELS = 10_000_000
+# Bytes of a pixel, at least: its height in the spec, in the model and in the host data's model, and color.
+_BYTES_PER_PIXEL = 14
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,12 @@ def divide_into_pixels(cfg: SubTerrainCfg, pixel_field: str = "horizontal_scale"
         cfg,
         "border_width",
         f"it must be 0, or at least one pixel ({pixel_field} = {pixel:g} m).",
+    )
+    refuse_unless(
+        all(extent / pixel <= _MAX_PIXELS for extent in cfg.size),
+        cfg,
+        pixel_field,
+        f"expected at most {_MAX_PIXELS:,} pixels of {tuple(cfg.size)} m. Use larger ones.",
     )
     border = int(border_width / pixel)
     cols, rows = (int(extent / pixel) for extent in cfg.size)
@@ -137,6 +146,15 @@ def add_heightfield(
         thickness_ratio: Thickness of the base over the elevation.
         flat_elevation: The elevation that a flat field states, in metres; MuJoCo refuses 0.
     """
+    # Each sub-terrain has a field of its own, and a picture of it.
+    pixels = surface.size + sum(field.nrow * field.ncol for field in spec.hfields)
+    memory = available_memory("cpu")
+    if memory is not None and pixels * _BYTES_PER_PIXEL > memory:
+        raise ValueError(
+            f"Height fields: expected at most {memory // _BYTES_PER_PIXEL:,} pixels, which is what "
+            f"{memory / 1e9:.1f} GB of memory can hold, got {pixels:,} so far; use a larger "
+            "horizontal_scale, or fewer sub-terrains."
+        )
     low = float(surface.min())
     span = float(surface.max()) - low
     elevation = span if span > 0.0 else flat_elevation

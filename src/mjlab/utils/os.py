@@ -170,17 +170,19 @@ def get_wandb_checkpoint_path(
         checkpoint_name: File name as "model_100.pt"; None takes the highest number.
 
     A cached file is used as it is. Raises `ValueError`, listing the checkpoints there are, if the
-    run does not have the one asked for.
+    run does not have the one asked for, and `ConnectionError` if Weights & Biases does not give it.
     """
-    import wandb
 
     cache = Path(log_path) / _WANDB_CACHE / Path(run_path).name
     if checkpoint_name is not None and _WANDB_CHECKPOINT.fullmatch(checkpoint_name):
         cached = cache / checkpoint_name
         if cached.is_file():
             return cached, True
-    run = wandb.Api().run(str(run_path))
-    names = [file.name for file in run.files() if _WANDB_CHECKPOINT.fullmatch(file.name)]
+    import wandb
+
+    with _asking_wandb(run_path):
+        run = wandb.Api().run(str(run_path))
+        names = [file.name for file in run.files() if _WANDB_CHECKPOINT.fullmatch(file.name)]
     names.sort(key=lambda name: int(name[len("model_") : -len(".pt")]))
     if not names or (checkpoint_name is not None and checkpoint_name not in names):
         raise ValueError(
@@ -193,10 +195,27 @@ def get_wandb_checkpoint_path(
         return target, True
     cache.mkdir(parents=True, exist_ok=True)
     # Downloaded next to its place and renamed, so that a broken transfer leaves nothing behind.
-    with tempfile.TemporaryDirectory(dir=cache) as folder:
+    with tempfile.TemporaryDirectory(dir=cache) as folder, _asking_wandb(run_path):
         run.file(name).download(folder, replace=True)
         os.replace(Path(folder) / name, target)
     return target, False
+
+
+@contextlib.contextmanager
+def _asking_wandb(run_path: Path) -> Generator[None]:
+    """Turn what wandb raises within the block into one `ConnectionError` that says what to do."""
+    try:
+        yield
+    except OSError:
+        # The disk's, and those of the network, which say what they are.
+        raise
+    except Exception as error:
+        # wandb raises errors of many kinds, of its own and of what it is built on.
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise ConnectionError(
+            f"The Weights & Biases run {str(run_path)!r} cannot be read: {reason} Use `wandb login`, and "
+            "a path as entity/project/run."
+        ) from error
 
 
 @contextlib.contextmanager

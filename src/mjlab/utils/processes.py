@@ -6,12 +6,20 @@ there is one process.
 
 from __future__ import annotations
 
+import functools
 import math
 import os
+import signal
+import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+# Set for a child that is to end with the process that started it: the number of that process.
+PARENT_VARIABLE = "MJLAB_PARENT_PID"
+
+_SECONDS_BETWEEN_LOOKS = 0.5
 _OWN_CGROUPS = Path("/proc/self/cgroup")
 _CGROUP_ROOT = Path("/sys/fs/cgroup")
 
@@ -73,6 +81,26 @@ def _number(variable: str, default: int) -> int:
             f"least {least}. torchrun sets it; unset it to train in one process."
         )
     return int(text)
+
+
+@functools.cache
+def end_with_launcher() -> None:
+    """Let this process get SIGTERM when its launcher is gone, even by SIGKILL; training then saves.
+
+    Does nothing unless our commands or torchrun started it: a shell may leave before its children.
+    """
+    # Not for processes that this one starts.
+    given = os.environ.pop(PARENT_VARIABLE, None)
+    if given is None and "TORCHELASTIC_RUN_ID" not in os.environ:
+        return
+    parent = os.getppid() if given is None else int(given)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_SECONDS_BETWEEN_LOOKS)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, name="end-with-launcher", daemon=True).start()
 
 
 def cores_per_process() -> int:

@@ -87,6 +87,8 @@ def with_long_quaternion() -> np.ndarray:
             {"body_lin_vel_w": with_nan()},
             "1 numbers that are NaN or infinite, the first in frame 7",
         ),
+        ({"joint_vel": np.full((10, 29), 1e39)}, "290 numbers that are NaN or infinite.*float32"),
+        ({"fps": np.array([1e39])}, "fps of the motion .* has to be one rate above 0"),
         ({"body_quat_w": with_long_quaternion()}, "frame 4, body 2 its norm is 1.1"),
         ({"joint_pos": SQUAT.joint_pos[:9]}, "differ in frames: .*'joint_pos': 9, 'joint_vel': 10"),
         ({"body_pos_w": SQUAT.body_pos_w[:10, :5]}, "differ in columns: .*'body_pos_w': 5"),

@@ -117,13 +117,16 @@ def write_motion(path: str | Path, motion: Motion) -> Path:
     The same motion always gives the same bytes.
 
     Raises:
-        MotionFileError: the motion has no frame rate.
+        MotionFileError: the motion has no frame rate, or numbers that are not finite as float32.
     """
     if motion.fps is None:
         raise MotionFileError(f"The motion to write to {path} has no fps.")
     path = npz_path(path)
     entries = {"fps": np.array([motion.fps], dtype=np.float32)}
-    entries |= {key: np.asarray(getattr(motion, key), dtype=np.float32) for key in _ARRAYS}
+    entries |= {
+        key: _checked_array(path, key, np.asarray(getattr(motion, key)), size).astype(np.float32)
+        for key, size in _ARRAYS.items()
+    }
     entries |= {
         key: np.array(names)
         for key in ("joint_names", "body_names")
@@ -225,12 +228,14 @@ def _checked_array(path: Path, key: str, value: np.ndarray, size: int | None) ->
         raise MotionFileError(
             f"{key} of the motion {path} has the shape {value.shape}; it has to be {wanted}."
         )
-    is_finite = np.isfinite(value)
+    # What is read and written is float32, in which numbers above 3.4e38 are infinite.
+    with np.errstate(over="ignore"):
+        is_finite = np.isfinite(value.astype(np.float32))
     if not is_finite.all():
         frame = int(np.argwhere(~is_finite)[0][0])
         raise MotionFileError(
             f"{key} of the motion {path} has {int((~is_finite).sum())} numbers that are NaN or "
-            f"infinite, the first in frame {frame}."
+            f"infinite, the first in frame {frame}; expected float32, up to 3.4e38."
         )
     return value
 
@@ -271,7 +276,8 @@ def _names(path: Path, key: str, value: np.ndarray | None) -> tuple[str, ...]:
 
 
 def _is_rate(array: np.ndarray) -> bool:
-    return 0.0 < float(array.reshape(())) < math.inf
+    with np.errstate(over="ignore", under="ignore"):
+        return 0.0 < float(np.float32(array.reshape(()))) < math.inf
 
 
 def _fps(path: Path, value: Any) -> float | None:

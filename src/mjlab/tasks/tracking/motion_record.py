@@ -60,7 +60,7 @@ def recorded_motions(run_dir: Path) -> list[Path]:
     try:
         entries = json.loads(index.read_text())
         listed = [(Path(str(entry["file"])).name, str(entry["sha256"])) for entry in entries]
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise MotionFileError(
             f"{index} is damaged ({error}). Name the motion with --motion-file."
         ) from error

@@ -1,0 +1,31 @@
+"""Mini-batches without data are refused before anything is learned."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import pytest
+
+from mjlab.rl.config import RslRlModelCfg, RslRlPpoAlgorithmCfg
+
+RECURRENT = asdict(
+    RslRlModelCfg(class_name="RNNModel", hidden_dims=(8,), rnn_type="gru", rnn_hidden_dim=8)
+)
+
+
+def algorithm(parts: int) -> dict:
+    return asdict(RslRlPpoAlgorithmCfg(num_mini_batches=parts))
+
+
+@pytest.mark.parametrize(
+    ("networks", "most"), [({}, 8 * 5), ({"critic": RECURRENT}, 8)], ids=["plain", "recurrent"]
+)
+def test_more_mini_batches_than_data_are_refused(make_runner, networks, most):
+    make_runner(num_envs=8, algorithm=algorithm(most), **networks).learn(1)
+    for parts in (0, most + 1):
+        with pytest.raises(ValueError, match=rf"num_mini_batches.*1 to {most}.*got {parts}"):
+            make_runner(num_envs=8, algorithm=algorithm(parts), **networks).learn(1)
+
+
+def test_a_runner_that_only_acts_takes_any_number_of_environments(make_runner):
+    make_runner(num_envs=1, algorithm=algorithm(4), critic=RECURRENT)
