@@ -9,6 +9,7 @@ import os
 import re
 import select
 import signal
+import socket
 import sys
 import threading
 import time
@@ -153,6 +154,8 @@ class Command:
                 os.close(read)
         out, err = (bytes(text).decode(errors="replace") for text in self._text)
         status = -signal.SIGKILL if self.status is None else self.status
+        # Seen with `--trial`.
+        print(f"{out}{err}[exit status {status}]", flush=True)
         return Ended(status, out, err, self._size, self._stuck, self._asked)
 
     def _collect(self, seconds: float) -> None:
@@ -205,6 +208,13 @@ def check_end(ended: Ended, *, statuses: Sequence[int] = (0, 1, 2, 130)) -> None
         raise Broken(f"exit status {ended.status} without a word")
     if ended.size > _OUTPUT:
         raise Broken(f"{ended.size:,} bytes of output")
+
+
+def free_port() -> int:
+    """Return a port of this machine that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
 
 
 def last_error(text: str) -> str:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from torture_parts.commands import TASK, Command, Ended, check_end, command
+from torture_parts.commands import TASK, Command, Ended, check_end, command, free_port
 from torture_parts.runs import check_loadable, learned, same, train_flags, trained
 from torture_parts.trials import Broken, Trial
 
@@ -136,7 +136,7 @@ def _read_by_plot(path: Path) -> Any:
 def _read_by_page(path: Path) -> Any:
     """Show a dump for a moment; what the page draws is not compared."""
     dump = path if path.suffix == ".npz" else path.parent / "nan_dump_latest.npz"
-    process = Command("viz_nan", [str(dump), "--port", str(random.randint(20000, 60000))])
+    process = Command("viz_nan", [str(dump), "--port", str(free_port())])
     process.watch(3.0)
     if process.status is None:
         process.signal(signal.SIGINT)
@@ -227,6 +227,37 @@ def _absurd_archive(data: bytes, rng: random.Random) -> tuple[bytes, str]:
     return buffer.getvalue(), f"{name} of an absurd shape"
 
 
+def _misfit(data: bytes, rng: random.Random) -> tuple[bytes, str]:
+    """Put something that does not fit in the place of one part of a checkpoint, which stays whole."""
+    import torch
+
+    content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    holder: Any = content
+    way: list[Any] = []
+    while True:
+        # Parts of all depths, and the whole as often as its parts.
+        way.append(rng.choice(list(holder) if isinstance(holder, dict) else range(len(holder))))
+        value = holder[way[-1]]
+        if not (isinstance(value, (dict, list)) and value) or rng.random() < 0.25:
+            break
+        holder = value
+    misfits: dict[str, Any] = {
+        "None": None, "a text": "text", "-1": -1, "1e30": 1e30, "nan": float("nan"), "{}": {},
+        "[[[]]]": [[[]]], "a tensor (2, 3)": torch.ones(2, 3),
+    }  # fmt: skip
+    if isinstance(value, torch.Tensor) and value.is_floating_point():
+        misfits["all nan"] = torch.full_like(value, torch.nan)
+        misfits["all inf"] = torch.full_like(value, torch.inf)
+    choice = rng.choice(["nothing", *misfits])
+    if choice != "nothing":
+        holder[way[-1]] = misfits[choice]
+    elif isinstance(holder, dict):
+        del holder[way[-1]]
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    return buffer.getvalue(), f"{'/'.join(map(str, way))} replaced by {choice}"
+
+
 _DAMAGES = (_flip, _flip, _flip, _flip, _cut, _cut, _zeros, _hole, _empty, _garbage, _absurd)
 
 
@@ -238,8 +269,10 @@ def run(trial: Trial, prepared: dict[str, Any]) -> None:
     good = Path(prepared["files"][kind])
     path = _copied(good, Path(prepared["run"]))
     damage = rng.choice(_DAMAGES)
+    if kind == "checkpoint" and rng.random() < 0.25:
+        damage, reader = _misfit, rng.choice((_read_by_resume, _read_by_resume, _read_by_evaluate))
     damaged, how = damage(good.read_bytes(), rng)
-    trial.what = f"{kind}, {how}, read by {reader.__name__.removeprefix('_read_')}"
+    trial.what = f"{kind}, {how}, reader {reader.__name__.removeprefix('_read_')}"
     # Read first as it was, by a copy of its own.
     expected = reader(path)
     path = _copied(good, Path(prepared["run"]))

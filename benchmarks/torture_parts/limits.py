@@ -1,0 +1,190 @@
+"""Training where files, memory or the folder run out: full disks, few open files, read-only folders."""
+
+from __future__ import annotations
+
+import os
+import random
+import resource
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from torture_parts.commands import Command, Ended, check_end
+from torture_parts.runs import check_loadable, checkpoints, leftovers, train_flags
+from torture_parts.trials import Broken, Trial
+
+WHAT = "limits on file sizes, open files and memory; read-only, missing and vanishing folders"
+TRIALS = 120
+LIMIT = 90.0
+
+_ITERATIONS = 8
+# User with few rights, for whom folders of others are read-only.
+_NOBODY = 65534
+
+
+def prepare(folder: Path) -> None:
+    """Nothing is shared."""
+
+
+def _limited(kind: int, value: int) -> Callable[[], None]:
+    return lambda: resource.setrlimit(kind, (value, value))
+
+
+def _train(root: Path, before: Callable[[], None] = lambda: None, *flags: str) -> Command:
+    return Command("train", train_flags(root, _ITERATIONS, *flags), before=before)
+
+
+def _check(ended: Ended, root: Path, *, may_succeed: bool = True) -> None:
+    """Raise Broken unless it finished, or said why not and kept what it had."""
+    check_end(ended)
+    check_loadable(root)
+    complete = any(path.name == f"model_{_ITERATIONS - 1}.pt" for path in checkpoints(root))
+    if ended.status == 0 and not complete:
+        raise Broken("exit status 0, though the last checkpoint is missing")
+    if ended.status == 0 and not may_succeed:
+        raise Broken("exit status 0, as if nothing had happened")
+    if left := leftovers(root):
+        raise Broken(f"temporary files are left: {', '.join(left)}")
+
+
+def _file_size(trial: Trial, root: Path) -> None:
+    # A checkpoint has about 170 kB. Output goes to a pipe and is not limited.
+    size = trial.rng.choice((0, 1000, trial.rng.randrange(200_000)))
+    trial.what = f"files limited to {size} bytes (RLIMIT_FSIZE)"
+    _check(_train(root, _limited(resource.RLIMIT_FSIZE, size)).end(), root)
+
+
+def _file_size_later(trial: Trial, root: Path) -> None:
+    size = trial.rng.randrange(170_000)
+    trial.what = f"files limited to {size} bytes after the first checkpoint"
+    process = _train(root)
+    process.watch(20.0, lambda: bool(checkpoints(root)))
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (size, size))
+    _check(process.end(), root)
+
+
+def _open_files(trial: Trial, root: Path) -> None:
+    count = trial.rng.randint(3, 40)
+    trial.what = f"{count} open files (RLIMIT_NOFILE)"
+    _check(_train(root, _limited(resource.RLIMIT_NOFILE, count)).end(), root)
+
+
+def _memory(trial: Trial, root: Path) -> None:
+    more = trial.rng.randrange(0, 600) << 20
+    trial.what = f"{more >> 20} MiB more memory (RLIMIT_AS)"
+
+    def limit() -> None:
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        _limited(resource.RLIMIT_AS, pages * resource.getpagesize() + more)()
+
+    _check(_train(root, limit).end(), root)
+
+
+def _file_for_folder(trial: Trial, root: Path) -> None:
+    place = trial.rng.choice((root, root / "cartpole"))
+    trial.what = f"a file in place of {place.relative_to(root.parent)}"
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.write_text("")
+    _check(_train(root).end(), root, may_succeed=False)
+
+
+def _special_folder(trial: Trial, root: Path) -> None:
+    place = trial.rng.choice(("/dev/null", "/proc/logs", "/sys/logs", "x" * 300, "\U0001f916 ä", "a\nb"))
+    trial.what = f"--log-root {place[:20]!r}"
+    check_end(_train(Path(place)).end())
+
+
+def _as_nobody(folder: Path) -> Callable[[], None]:
+    def give_up_rights() -> None:
+        if os.getuid() == 0:
+            os.chown(folder, _NOBODY, _NOBODY)
+            os.setgid(_NOBODY)
+            os.setuid(_NOBODY)
+
+    return give_up_rights
+
+
+def _read_only(trial: Trial, root: Path) -> None:
+    trial.what = "a log folder without write access"
+    root.mkdir()
+    root.chmod(0o555)
+    _opened(trial)
+    _check(_train(root, _as_nobody(root)).end(), root, may_succeed=False)
+
+
+def _turns_read_only(trial: Trial, root: Path) -> None:
+    trial.what = "a log folder that loses write access after the first checkpoint"
+    root.mkdir()
+    _opened(trial)
+    process = _train(root, _as_nobody(root))
+    process.watch(20.0, lambda: bool(checkpoints(root)))
+    for folder in [*root.glob("**"), root]:
+        folder.chmod(0o555)
+    _check(process.end(), root, may_succeed=process.status is not None)
+
+
+def _opened(trial: Trial) -> None:
+    """Let everybody pass through the folders above that of a trial."""
+    above = trial.folder
+    while above.name and above != Path("/tmp") and os.stat(above).st_uid == os.getuid():
+        above.chmod(0o755)
+        above = above.parent
+
+
+def _deleted(trial: Trial, root: Path) -> None:
+    what = trial.rng.choice(("run", "experiment", "root"))
+    trial.what = f"the {what} folder is deleted after the first checkpoint"
+    process = _train(root)
+    process.watch(20.0, lambda: bool(checkpoints(root)))
+    run = checkpoints(root)[0].parent
+    is_over = process.status is not None
+    gone = {"run": run, "experiment": run.parent, "root": root}[what]
+    gone.rename(root.parent / "gone")
+    shutil.rmtree(root.parent / "gone")
+    ended = process.end()
+    check_end(ended)
+    if is_over:
+        return
+    if ended.status == 0:
+        raise Broken("exit status 0, as if nothing had happened")
+    if not checkpoints(root.parent):
+        raise Broken("what was in memory is lost")
+    if str(run) not in ended.said:
+        raise Broken(f"the folder is not named: {ended.err.splitlines()[0]}")
+
+
+def _output_full(trial: Trial, root: Path) -> None:
+    target = trial.rng.choice(("/dev/full", "closed"))
+    which = trial.rng.choice((1, 2))
+    trial.what = f"output {which} is {target}"
+
+    def redirect() -> None:
+        os.dup2(os.open("/dev/full", os.O_WRONLY), which) if target != "closed" else os.close(which)
+
+    ended = _train(root, redirect).end()
+    check_loadable(root)
+    if ended.stuck or ended.status < 0 or "Traceback" in ended.said:
+        check_end(ended)
+
+
+def _no_home(trial: Trial, root: Path) -> None:
+    home = trial.rng.choice(("/nonexistent", "", "/dev/null"))
+    trial.what = f"HOME={home!r}"
+
+    def move() -> None:
+        os.environ["HOME"] = home
+
+    _check(_train(root, move).end(), root)
+
+
+_KINDS = (
+    _file_size, _file_size_later, _open_files, _memory, _deleted, _file_size, _open_files, _memory,
+    _read_only, _turns_read_only, _file_for_folder, _special_folder, _output_full, _no_home,
+)  # fmt: skip
+
+
+def run(trial: Trial, prepared: Any) -> None:
+    """Train under one limit."""
+    random.seed(trial.number)
+    _KINDS[trial.number % len(_KINDS)](trial, Path("logs").resolve())
