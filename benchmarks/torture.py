@@ -84,9 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return int(any(result.failed for result in results))
 
 
-def run_part(
-    part: str, seed: int, minutes: float, number: int | None, folder: Path
-) -> Result:
+def run_part(part: str, seed: int, minutes: float, number: int | None, folder: Path) -> Result:
     """Run the trials of one family, or that of one `number`."""
     module = importlib.import_module(f"torture_parts.{part}")
     count = max(1, round(module.TRIALS * minutes / MINUTES))

@@ -101,6 +101,7 @@ class Command:
         self._text = [bytearray(), bytearray()]
         self._size = 0
         self._asked = False
+        self._memory_due = 0.0
         self._stuck: str | None = None
         self.status: int | None = None
         sys.stdout.flush()
@@ -126,7 +127,7 @@ class Command:
             if pid:
                 self.status = os.waitstatus_to_exitcode(status)
                 self._collect(0.0)
-            elif self._stuck is None and self._memory() > MEMORY:
+            elif self._stuck is None and self._takes_too_much():
                 self._stuck = f"took more than {MEMORY >> 30} GiB of memory"
                 self.signal(signal.SIGKILL)
             elif until():
@@ -173,14 +174,17 @@ class Command:
             # Closed, by a command that is about to end.
             time.sleep(seconds)
 
-    def _memory(self) -> int:
-        """Bytes in memory that are its own."""
+    def _takes_too_much(self) -> bool:
+        """Return whether its processes have more memory of their own than they may, now and then."""
+        if time.monotonic() < self._memory_due:
+            return False
+        self._memory_due = time.monotonic() + 0.2
         total = 0
-        for pid in (self.pid, *descendants(self.pid)) if self._asked else (self.pid,):
+        for pid in (self.pid, *descendants(self.pid)):
             with contextlib.suppress(OSError, IndexError, ValueError):
                 pages = Path(f"/proc/{pid}/statm").read_text().split()
                 total += (int(pages[1]) - int(pages[2])) * os.sysconf("SC_PAGE_SIZE")
-        return total
+        return total > MEMORY
 
 
 def command(
@@ -252,7 +256,7 @@ def _become(script: str, argv: list[str], before: Callable[[], None], is_fresh: 
                 print(end.code, file=sys.stderr)
         except BaseException:
             traceback.print_exc()
-        threading._shutdown()  # ty: ignore[unresolved-attribute]
+        threading._shutdown()  # ty: ignore[missing-attribute]
         atexit._run_exitfuncs()
         try:
             sys.stdout.flush()

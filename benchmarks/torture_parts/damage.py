@@ -14,10 +14,10 @@ from typing import Any
 
 from torture_parts.commands import TASK, Command, Ended, check_end, command, free_port
 from torture_parts.runs import check_loadable, learned, same, train_flags, trained
-from torture_parts.trials import Broken, Trial
+from torture_parts.trials import Broken, Trial, name_of
 
 WHAT = "one flipped bit, cut, emptied, overwritten and absurdly nested files of all kinds"
-TRIALS = 420
+TRIALS = 280
 LIMIT = 90.0
 
 _ITERATIONS = 2
@@ -272,7 +272,7 @@ def run(trial: Trial, prepared: dict[str, Any]) -> None:
     if kind == "checkpoint" and rng.random() < 0.25:
         damage, reader = _misfit, rng.choice((_read_by_resume, _read_by_resume, _read_by_evaluate))
     damaged, how = damage(good.read_bytes(), rng)
-    trial.what = f"{kind}, {how}, reader {reader.__name__.removeprefix('_read_')}"
+    trial.trying(f"{kind}, {how}, {name_of(reader)}")
     # Read first as it was, by a copy of its own.
     expected = reader(path)
     path = _copied(good, Path(prepared["run"]))
@@ -298,7 +298,9 @@ def _copied(good: Path, run: Path) -> Path:
     if good.is_relative_to(run):
         shutil.copytree(run, here / "logs/cartpole" / run.name)
         return here / "logs/cartpole" / run.name / good.relative_to(run)
-    shutil.copytree(good.parent, here, symlinks=True) if good.parent.name == "dumps" else here.mkdir()
+    shutil.copytree(
+        good.parent, here, symlinks=True
+    ) if good.parent.name == "dumps" else here.mkdir()
     path = here / good.name
     shutil.copy(good, path)
     return path

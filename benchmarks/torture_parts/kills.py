@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import time
 from pathlib import Path
@@ -21,14 +22,16 @@ from torture_parts.runs import (
 from torture_parts.trials import Broken, Trial
 
 WHAT = "chains of signals at random moments and resumes, compared with the run that none ended"
-TRIALS = 40
+TRIALS = 30
 LIMIT = 180.0
 
 _ITERATIONS = 24
 _SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 _MOST_KILLS = 4
-# Every so manieth chain starts Python each time, so that imports are interrupted, too.
+# Every n-th chain starts Python each time, so that imports are interrupted, too.
 _FRESH = 8
+# Every n-th trial kills a process that has started another for the training.
+_LAUNCHERS = 10
 
 
 def prepare(folder: Path) -> dict[str, Any]:
@@ -40,15 +43,17 @@ def prepare(folder: Path) -> dict[str, Any]:
 
 def run(trial: Trial, prepared: dict[str, Any]) -> None:
     """Kill and resume a run a few times, let it finish, and compare."""
+    if trial.number % _LAUNCHERS == _LAUNCHERS - 1:
+        _kill_launcher(trial)
+        return
     rng, root = trial.rng, Path("logs").resolve()
     is_fresh = trial.number % _FRESH == _FRESH - 1
     kinds = [_SIGNALS[(trial.number + k) % 4] for k in range(rng.randint(1, _MOST_KILLS))]
     # Longer than a run on a quiet machine takes, so that its end is hit, too.
     delays = [rng.uniform(0.0, 1.1) for _ in kinds]
     longest = prepared["seconds"] + (4.0 if is_fresh else 0.0)
-    trial.what = f"{'fresh ' if is_fresh else ''}chain of " + ", ".join(
-        f"{kind.name} at {delay:.2f}" for kind, delay in zip(kinds, delays, strict=True)
-    )
+    what = (f"{kind.name} at {delay:.2f}" for kind, delay in zip(kinds, delays, strict=True))
+    trial.trying(f"{'fresh ' if is_fresh else ''}chain of {', '.join(what)}")
     for kind, delay in zip(kinds, delays, strict=True):
         before = set(root.glob("cartpole/*"))
         process = _start(root, is_fresh)
@@ -70,6 +75,18 @@ def run(trial: Trial, prepared: dict[str, Any]) -> None:
         raise Broken("the weights are not those of the uninterrupted run")
     if left := leftovers(root):
         raise Broken(f"temporary files are left: {', '.join(left)}")
+
+
+def _kill_launcher(trial: Trial) -> None:
+    """Kill `train-seeds` alone. That no process outlives a trial is checked after each."""
+    kind = trial.rng.choice((signal.SIGKILL, signal.SIGTERM, signal.SIGHUP))
+    trial.trying(f"{kind.name} to train-seeds alone, in its first training")
+    root = Path("logs").resolve()
+    process = Command("train_seeds", [*train_flags(root, 100_000), "--seeds", "2"])
+    if process.watch(60.0, lambda: bool(checkpoints(root))):
+        os.kill(process.pid, kind)
+    process.end(30.0)
+    check_loadable(root)
 
 
 def _start(root: Path, is_fresh: bool) -> Command:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import resource
 import shutil
 from collections.abc import Callable
@@ -15,7 +14,7 @@ from torture_parts.runs import check_loadable, checkpoints, leftovers, train_fla
 from torture_parts.trials import Broken, Trial
 
 WHAT = "limits on file sizes, open files and memory; read-only, missing and vanishing folders"
-TRIALS = 120
+TRIALS = 98
 LIMIT = 90.0
 
 _ITERATIONS = 8
@@ -51,13 +50,13 @@ def _check(ended: Ended, root: Path, *, may_succeed: bool = True) -> None:
 def _file_size(trial: Trial, root: Path) -> None:
     # A checkpoint has about 170 kB. Output goes to a pipe and is not limited.
     size = trial.rng.choice((0, 1000, trial.rng.randrange(200_000)))
-    trial.what = f"files limited to {size} bytes (RLIMIT_FSIZE)"
+    trial.trying(f"files limited to {size} bytes (RLIMIT_FSIZE)")
     _check(_train(root, _limited(resource.RLIMIT_FSIZE, size)).end(), root)
 
 
 def _file_size_later(trial: Trial, root: Path) -> None:
     size = trial.rng.randrange(170_000)
-    trial.what = f"files limited to {size} bytes after the first checkpoint"
+    trial.trying(f"files limited to {size} bytes after the first checkpoint")
     process = _train(root)
     process.watch(20.0, lambda: bool(checkpoints(root)))
     resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (size, size))
@@ -66,13 +65,13 @@ def _file_size_later(trial: Trial, root: Path) -> None:
 
 def _open_files(trial: Trial, root: Path) -> None:
     count = trial.rng.randint(3, 40)
-    trial.what = f"{count} open files (RLIMIT_NOFILE)"
+    trial.trying(f"{count} open files (RLIMIT_NOFILE)")
     _check(_train(root, _limited(resource.RLIMIT_NOFILE, count)).end(), root)
 
 
 def _memory(trial: Trial, root: Path) -> None:
     more = trial.rng.randrange(0, 600) << 20
-    trial.what = f"{more >> 20} MiB more memory (RLIMIT_AS)"
+    trial.trying(f"{more >> 20} MiB more memory (RLIMIT_AS)")
 
     def limit() -> None:
         pages = int(Path("/proc/self/statm").read_text().split()[0])
@@ -83,15 +82,17 @@ def _memory(trial: Trial, root: Path) -> None:
 
 def _file_for_folder(trial: Trial, root: Path) -> None:
     place = trial.rng.choice((root, root / "cartpole"))
-    trial.what = f"a file in place of {place.relative_to(root.parent)}"
+    trial.trying(f"a file in place of {place.relative_to(root.parent)}")
     place.parent.mkdir(parents=True, exist_ok=True)
     place.write_text("")
     _check(_train(root).end(), root, may_succeed=False)
 
 
 def _special_folder(trial: Trial, root: Path) -> None:
-    place = trial.rng.choice(("/dev/null", "/proc/logs", "/sys/logs", "x" * 300, "\U0001f916 ä", "a\nb"))
-    trial.what = f"--log-root {place[:20]!r}"
+    place = trial.rng.choice(
+        ("/dev/null", "/proc/logs", "/sys/logs", "x" * 300, "\U0001f916 ä", "a\nb")
+    )
+    trial.trying(f"--log-root {place[:20]!r}")
     check_end(_train(Path(place)).end())
 
 
@@ -106,7 +107,7 @@ def _as_nobody(folder: Path) -> Callable[[], None]:
 
 
 def _read_only(trial: Trial, root: Path) -> None:
-    trial.what = "a log folder without write access"
+    trial.trying("a log folder without write access")
     root.mkdir()
     root.chmod(0o555)
     _opened(trial)
@@ -114,7 +115,7 @@ def _read_only(trial: Trial, root: Path) -> None:
 
 
 def _turns_read_only(trial: Trial, root: Path) -> None:
-    trial.what = "a log folder that loses write access after the first checkpoint"
+    trial.trying("a log folder that loses write access after the first checkpoint")
     root.mkdir()
     _opened(trial)
     process = _train(root, _as_nobody(root))
@@ -134,7 +135,7 @@ def _opened(trial: Trial) -> None:
 
 def _deleted(trial: Trial, root: Path) -> None:
     what = trial.rng.choice(("run", "experiment", "root"))
-    trial.what = f"the {what} folder is deleted after the first checkpoint"
+    trial.trying(f"the {what} folder is deleted after the first checkpoint")
     process = _train(root)
     process.watch(20.0, lambda: bool(checkpoints(root)))
     run = checkpoints(root)[0].parent
@@ -157,7 +158,7 @@ def _deleted(trial: Trial, root: Path) -> None:
 def _output_full(trial: Trial, root: Path) -> None:
     target = trial.rng.choice(("/dev/full", "closed"))
     which = trial.rng.choice((1, 2))
-    trial.what = f"output {which} is {target}"
+    trial.trying(f"output {which} is {target}")
 
     def redirect() -> None:
         os.dup2(os.open("/dev/full", os.O_WRONLY), which) if target != "closed" else os.close(which)
@@ -170,7 +171,7 @@ def _output_full(trial: Trial, root: Path) -> None:
 
 def _no_home(trial: Trial, root: Path) -> None:
     home = trial.rng.choice(("/nonexistent", "", "/dev/null"))
-    trial.what = f"HOME={home!r}"
+    trial.trying(f"HOME={home!r}")
 
     def move() -> None:
         os.environ["HOME"] = home
@@ -186,5 +187,4 @@ _KINDS = (
 
 def run(trial: Trial, prepared: Any) -> None:
     """Train under one limit."""
-    random.seed(trial.number)
     _KINDS[trial.number % len(_KINDS)](trial, Path("logs").resolve())

@@ -5,6 +5,7 @@ A family is a module with
 - `WHAT`: what is tried, for people,
 - `TRIALS`: number of trials in 15 minutes,
 - `LIMIT`: seconds for one,
+- `preload()`, if it needs more imports than `commands.preload`,
 - `prepare(folder)`: what all its trials share, as plain data; files go to `folder`,
 - `run(trial, prepared)`: one trial, which raises `Broken` if the contract was.
 
@@ -50,13 +51,18 @@ class Trial:
     folder: Path
     """Folder of its own, which is the working folder, and is removed afterwards."""
     what: str = ""
-    """What is tried, for the line of a failure; set by the family."""
+    """What is tried, for the line of a failure; see `trying`."""
     notes: list[str] = field(default_factory=list)
     """Observations that are no failures."""
     rng: random.Random = field(init=False)
 
     def __post_init__(self) -> None:
         self.rng = random.Random(f"{self.seed}/{self.family}/{self.number}")
+
+    def trying(self, what: str) -> None:
+        """Say what is tried, also for a trial that does not come to its end."""
+        self.what = what
+        (self.folder.parents[3] / "what").write_text(what, "utf-8", "replace")
 
 
 @dataclass(frozen=True)
@@ -95,6 +101,7 @@ def run_trials(
     become_reaper()
     shared = folder / "shared"
     shared.mkdir(parents=True)
+    getattr(module, "preload", lambda: None)()
     prepared = _prepared(module, shared)
     waiting = list(numbers)[::-1]
     running: dict[int, tuple[Trial, float]] = {}
@@ -124,7 +131,7 @@ def run_trials(
 def _verdict(trial: Trial, own: Path, status: int, limit: float | None) -> Verdict:
     with contextlib.suppress(FileNotFoundError):
         return pickle.loads((own / "verdict").read_bytes())
-    what = (own / "what").read_text() if (own / "what").is_file() else "?"
+    what = (own / "what").read_text("utf-8") if (own / "what").is_file() else "?"
     how = "the trial itself ended" if limit is None else f"no end after {limit:.0f} s"
     code = os.waitstatus_to_exitcode(status)
     return Verdict(trial.family, trial.number, what, how if limit else f"{how} with status {code}")
@@ -213,7 +220,9 @@ def descendants(pid: int) -> list[int]:
     for entry in os.listdir("/proc"):
         if entry.isdigit():
             with contextlib.suppress(OSError):
-                state, parent = Path(f"/proc/{entry}/stat").read_text().rsplit(")", 1)[1].split()[:2]
+                state, parent = (
+                    Path(f"/proc/{entry}/stat").read_text().rsplit(")", 1)[1].split()[:2]
+                )
                 if state != "Z":
                     children.setdefault(int(parent), []).append(int(entry))
     found, ahead = [], [pid]
@@ -241,6 +250,11 @@ def _left_over() -> list[str]:
         with contextlib.suppress(OSError):
             names.append(Path(f"/proc/{pid}/comm").read_text().strip())
     return names
+
+
+def name_of(function: Callable[..., Any]) -> str:
+    """Return the name of a function as words."""
+    return getattr(function, "__name__", "").strip("_").replace("_", " ")
 
 
 def _first_line(error: BaseException) -> str:
