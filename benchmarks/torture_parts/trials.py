@@ -117,9 +117,9 @@ def run_trials(
             ended, status = os.waitpid(pid, os.WNOHANG)
             too_late = not ended and time.monotonic() - begin > module.LIMIT
             if too_late:
-                end_descendants(pid)
+                orphans = end_descendants(pid)
                 os.kill(pid, signal.SIGKILL)
-                os.waitpid(pid, 0)
+                _reap([pid, *orphans])
             if ended or too_late:
                 del running[pid]
                 own = folder / f"trial_{trial.number}"
@@ -167,7 +167,7 @@ def _fork_trial(trial: Trial, module: ModuleType, prepared: Any, show: bool) -> 
     verdict = Verdict(trial.family, trial.number, trial.what, broken, tuple(trial.notes))
     (own / "draft").write_bytes(pickle.dumps(verdict))
     os.replace(own / "draft", own / "verdict")
-    end_descendants(os.getpid())
+    _reap(end_descendants(os.getpid()))
     os._exit(0)
 
 
@@ -233,11 +233,20 @@ def descendants(pid: int) -> list[int]:
     return found
 
 
-def end_descendants(pid: int) -> None:
-    """Kill all processes below `pid`."""
-    for child in descendants(pid):
+def end_descendants(pid: int) -> list[int]:
+    """Kill all processes below `pid`, and return them."""
+    found = descendants(pid)
+    for child in found:
         with contextlib.suppress(ProcessLookupError):
             os.kill(child, signal.SIGKILL)
+    return found
+
+
+def _reap(pids: Iterable[int]) -> None:
+    """Let go of processes that were killed, as far as they are children of this one."""
+    for pid in pids:
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(pid, 0)
 
 
 def _left_over() -> list[str]:
