@@ -23,13 +23,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / "src"), str(ROOT / "benchmarks")]
-# Commands that are started as processes of their own are to find the same files.
-os.environ["PYTHONPATH"] = os.pathsep.join(
-    [str(ROOT / "src"), *filter(None, [os.environ.get("PYTHONPATH")])]
-)
+sys.path.insert(0, str(ROOT / "benchmarks"))
 
-from torture_parts.commands import preload  # noqa: E402 - found by the lines above.
+from torture_parts.commands import preload  # noqa: E402 - found by the line above.
 from torture_parts.trials import Verdict, run_trials  # noqa: E402
 
 PARTS = ("kills", "damage", "limits", "command_lines", "config_files", "physics", "page")
@@ -59,9 +55,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--trial", type=int, help="only this trial, and what its commands print")
     parser.add_argument("--out", type=Path, help="Markdown file to write the table to")
+    parser.add_argument(
+        "--checkout", type=Path, default=ROOT, help="project to examine, such as an earlier one"
+    )
     args = parser.parse_args(argv)
     if args.trial is not None and len(args.part) != 1:
         parser.error("--trial needs one --part")
+    source = str(args.checkout.resolve() / "src")
+    sys.path.insert(0, source)
+    # Processes of their own are to find the same files.
+    paths = [source, *filter(None, [os.environ.get("PYTHONPATH")])]
+    os.environ["PYTHONPATH"] = os.pathsep.join(paths)
     preload()
     # Forked processes share memory for as long as nobody writes to it.
     gc.collect()

@@ -3,23 +3,37 @@
 from __future__ import annotations
 
 import os
+import re
 import resource
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from torture_parts.commands import Command, Ended, check_end
+from torture_parts.commands import PATIENCE, Command, Ended, check_end, free_port
 from torture_parts.runs import check_loadable, checkpoints, leftovers, train_flags
 from torture_parts.trials import Broken, Trial
 
-WHAT = "limits on file sizes, open files and memory; read-only, missing and vanishing folders"
-TRIALS = 98
+WHAT = "limits on files and memory, read-only and vanishing folders, odd variables"
+TRIALS = 112
 LIMIT = 90.0
 
 _ITERATIONS = 8
 # User with few rights, for whom folders of others are read-only.
 _NOBODY = 65534
+# Seconds after which processes should have said that they wait for others.
+_WAIT = 20.0
+_VARIABLES = (
+    ("MUJOCO_GL", "nonsense"), ("WORLD_SIZE", "2"), ("TMPDIR", "/nonexistent"), ("RANK", "5"),
+    ("OMP_NUM_THREADS", "many"), ("WORLD_SIZE", "many"), ("MUJOCO_GL", ""), ("WORLD_SIZE", "0"), ("LOCAL_RANK", "-1"), ("CUDA_VISIBLE_DEVICES", "9"),
+    ("OMP_NUM_THREADS", "-1"),
+    ("PYTHONIOENCODING", "ascii"), ("LC_ALL", "C"), ("TERM", "nonsense"), ("COLUMNS", "1"),
+    ("COLUMNS", "many"), ("MPLCONFIGDIR", "/dev/null"), ("MPLBACKEND", "nonsense"),
+    ("TORCHRUNX_LOG_DIR", "/dev/null"), ("WANDB_MODE", "nonsense"), ("DISPLAY", ":99"),
+    ("PYTHONWARNINGS", "error"), ("PYTHONOPTIMIZE", "2"), ("PATH", ""),
+)  # fmt: skip
+# What is set along with a variable.
+_WITH = {"WORLD_SIZE": {"RANK": "0", "LOCAL_RANK": "0", "MASTER_ADDR": "127.0.0.1"}}
 
 
 def prepare(folder: Path) -> None:
@@ -179,9 +193,26 @@ def _no_home(trial: Trial, root: Path) -> None:
     _check(_train(root, move).end(), root)
 
 
+def _environment(trial: Trial, root: Path) -> None:
+    # In turn; another seed begins elsewhere.
+    turn = trial.number // (len(_KINDS) // _KINDS.count(_environment)) + 7 * trial.seed
+    name, value = _VARIABLES[turn % len(_VARIABLES)]
+    trial.trying(f"{name}={value!r}")
+    variables = {"MASTER_PORT": str(free_port()), name: value, **_WITH.get(name, {})}
+    # Much of the environment is read by imports.
+    flags = train_flags(root, _ITERATIONS)
+    process = Command("train", flags, before=lambda: os.environ.update(variables), is_fresh=True)
+    ended = process.end(_WAIT if name == "WORLD_SIZE" else PATIENCE)
+    check_end(ended)
+    check_loadable(root)
+    if ended.was_asked and not re.search(r"wait|WORLD_SIZE", ended.said):
+        raise Broken("waits without saying for whom")
+
+
 _KINDS = (
-    _file_size, _file_size_later, _open_files, _memory, _deleted, _file_size, _open_files, _memory,
-    _read_only, _turns_read_only, _file_for_folder, _special_folder, _output_full, _no_home,
+    _file_size, _file_size_later, _open_files, _memory, _deleted, _file_size, _open_files,
+    _environment, _memory, _read_only, _turns_read_only, _file_for_folder, _special_folder,
+    _output_full, _no_home, _environment,
 )  # fmt: skip
 
 
