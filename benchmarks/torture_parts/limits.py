@@ -163,7 +163,8 @@ def _deleted(trial: Trial, root: Path) -> None:
         return
     if ended.status == 0:
         raise Broken("exit status 0, as if nothing had happened")
-    if not checkpoints(root.parent):
+    named = [Path(word) for word in re.findall(r"/[^\s'\",;:]*\.pt", ended.said)]
+    if not any(path.is_file() for path in [*checkpoints(root.parent), *named]):
         raise Broken("what was in memory is lost")
     if str(run) not in ended.said:
         raise Broken(f"the folder is not named: {ended.err.splitlines()[0]}")
