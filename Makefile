@@ -3,7 +3,7 @@ UV := ./tools/uv
 DEV := $(UV) run --group dev
 
 .PHONY: help train test test-slow test-gpu-script test-mujoco-next check format bench reference gpu \
-	packages docs
+	torture packages docs
 
 help:  ## Show this list.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -56,6 +56,10 @@ DEVICE ?= cuda:0
 
 gpu:  ## Test and measure on an NVIDIA GPU, in ten minutes; PARTS="parity speed" for some parts.
 	$(PYTHON) benchmarks/gpu.py --device $(DEVICE) $(if $(PARTS),--part $(PARTS)) $(GPU_FLAGS)
+
+torture:  ## Kill, damage, limit, mistake and attack, in 15 minutes; PARTS="kills page" SEED=N MINUTES=N.
+	$(DEV) python benchmarks/torture.py $(if $(PARTS),--part $(PARTS)) $(if $(SEED),--seed $(SEED)) \
+		$(if $(MINUTES),--minutes $(MINUTES)) $(TORTURE_FLAGS)
 
 packages:  ## Try task packages: make packages DIRS="../a ../b"; without DIRS, those of the tests.
 	$(DEV) python tools/packages.py $(DIRS) $(if $(ENGINES),--engines $(ENGINES))

@@ -1,0 +1,270 @@
+"""Trials: what a family consists of, and running each in a process of its own.
+
+A family is a module with
+
+- `WHAT`: what is tried, for people,
+- `TRIALS`: number of trials in 15 minutes,
+- `LIMIT`: seconds for one,
+- `preload()`, if it needs more imports than `commands.preload`,
+- `prepare(folder)`: what all its trials share, as plain data; files go to `folder`,
+- `run(trial, prepared)`: one trial, which raises `Broken` if the contract was.
+
+What a trial does follows from its family, its number and the seed alone, so that each can be repeated.
+Processes are forked from one that has imported everything, because an import takes longer than most
+trials.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import pickle
+import random
+import shutil
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+_SET_CHILD_SUBREAPER = 36
+# Seconds that processes which a command started have to end after it.
+_GRACE = 2.0
+
+
+class Broken(Exception):
+    """Raised by a trial where the contract is broken; the text says how, in one line."""
+
+
+@dataclass
+class Trial:
+    """One trial, within its process."""
+
+    family: str
+    number: int
+    seed: int
+    folder: Path
+    """Folder of its own, which is the working folder, and is removed afterwards."""
+    what: str = ""
+    """What is tried, for the line of a failure; see `trying`."""
+    notes: list[str] = field(default_factory=list)
+    """Observations that are no failures."""
+    rng: random.Random = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.rng = random.Random(f"{self.seed}/{self.family}/{self.number}")
+
+    def trying(self, what: str) -> None:
+        """Say what is tried, also for a trial that does not come to its end."""
+        self.what = what
+        (self.folder.parents[3] / "what").write_text(what, "utf-8", "replace")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How a trial ended."""
+
+    family: str
+    number: int
+    what: str = ""
+    broken: str | None = None
+    """How the contract was broken; None if it was held."""
+    notes: tuple[str, ...] = ()
+
+    def line(self, seed: int) -> str:
+        """Return the failure, and the command that repeats it, in one line."""
+        flags = f"--part {self.family} --seed {seed} --trial {self.number}"
+        text = " ".join(f"{self.what}: {self.broken}".split())
+        return f"{text} (`python benchmarks/torture.py {flags}`)"
+
+
+def run_trials(
+    family: str,
+    module: ModuleType,
+    numbers: Iterable[int],
+    seed: int,
+    folder: Path,
+    *,
+    workers: int = 2,
+    show: bool = False,
+) -> Iterator[Verdict]:
+    """Run the trials of a family, `workers` at a time, and yield how each ended, in any order.
+
+    Raises:
+        RuntimeError: what the trials share could not be prepared.
+    """
+    become_reaper()
+    shared = folder / "shared"
+    shared.mkdir(parents=True)
+    getattr(module, "preload", lambda: None)()
+    prepared = _prepared(module, shared)
+    waiting = list(numbers)[::-1]
+    running: dict[int, tuple[Trial, float]] = {}
+    while waiting or running:
+        while waiting and len(running) < workers:
+            number = waiting.pop()
+            own = folder / f"trial_{number}"
+            # Relative paths with `..` stay in the trial's folder.
+            trial = Trial(family, number, seed, own / "a/b/c/d")
+            trial.folder.mkdir(parents=True)
+            running[_fork_trial(trial, module, prepared, show)] = trial, time.monotonic()
+        for pid, (trial, begin) in list(running.items()):
+            ended, status = os.waitpid(pid, os.WNOHANG)
+            too_late = not ended and time.monotonic() - begin > module.LIMIT
+            if too_late:
+                orphans = end_descendants(pid)
+                os.kill(pid, signal.SIGKILL)
+                _reap([pid, *orphans])
+            if ended or too_late:
+                del running[pid]
+                own = folder / f"trial_{trial.number}"
+                yield _verdict(trial, own, status, module.LIMIT if too_late else None)
+                shutil.rmtree(own, ignore_errors=True)
+        time.sleep(0.005)
+
+
+def _verdict(trial: Trial, own: Path, status: int, limit: float | None) -> Verdict:
+    with contextlib.suppress(FileNotFoundError):
+        return pickle.loads((own / "verdict").read_bytes())
+    what = (own / "what").read_text("utf-8") if (own / "what").is_file() else "?"
+    how = "the trial itself ended" if limit is None else f"no end after {limit:.0f} s"
+    code = os.waitstatus_to_exitcode(status)
+    return Verdict(trial.family, trial.number, what, how if limit else f"{how} with status {code}")
+
+
+def _fork_trial(trial: Trial, module: ModuleType, prepared: Any, show: bool) -> int:
+    sys.stdout.flush()
+    sys.stderr.flush()
+    pid = os.fork()
+    if pid:
+        return pid
+    os.setsid()
+    become_reaper()
+    own = trial.folder.parents[3]
+    if not show:
+        with open(os.devnull, "w") as nothing:
+            os.dup2(nothing.fileno(), 1)
+            os.dup2(nothing.fileno(), 2)
+    broken: str | None = None
+    try:
+        os.chdir(trial.folder)
+        module.run(trial, prepared)
+        left = _left_over()
+        if left:
+            broken = f"left {len(left)} processes running: {', '.join(left)}"
+    except Broken as error:
+        broken = str(error)
+    except BaseException as error:
+        traceback.print_exc()
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        place = f"{Path(frame.filename).name}:{frame.lineno}"
+        broken = f"raised {type(error).__name__} at {place}: {_first_line(error)}"
+    verdict = Verdict(trial.family, trial.number, trial.what, broken, tuple(trial.notes))
+    (own / "draft").write_bytes(pickle.dumps(verdict))
+    os.replace(own / "draft", own / "verdict")
+    _reap(end_descendants(os.getpid()))
+    os._exit(0)
+
+
+def _prepared(module: ModuleType, folder: Path) -> Any:
+    """Return what `module.prepare` does, in a process of its own: threads do not survive a fork."""
+    answer = folder.parent / "prepared"
+
+    def prepare() -> None:
+        os.chdir(folder)
+        answer.write_bytes(pickle.dumps(module.prepare(folder)))
+
+    output = folder.parent / "prepare.log"
+    status = in_fork(prepare, output)
+    if status != 0:
+        raise RuntimeError(f"{module.__name__}.prepare failed:\n{output.read_text()[-3000:]}")
+    return pickle.loads(answer.read_bytes())
+
+
+def in_fork(function: Callable[[], None], output: Path) -> int:
+    """Call `function` in a forked process whose output goes to a file; return the exit status."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    pid = os.fork()
+    if pid:
+        return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    status = 1
+    try:
+        with open(output, "w") as file:
+            os.dup2(file.fileno(), 1)
+            os.dup2(file.fileno(), 2)
+        function()
+        status = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        with contextlib.suppress(Exception):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(status)
+
+
+def become_reaper() -> None:
+    """Adopt processes whose parents end, so that they can be found."""
+    ctypes.CDLL(None).prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
+def descendants(pid: int) -> list[int]:
+    """Return the processes that `pid` and those that it started have started, zombies aside."""
+    children: dict[int, list[int]] = {}
+    for entry in os.listdir("/proc"):
+        if entry.isdigit():
+            with contextlib.suppress(OSError):
+                state, parent = (
+                    Path(f"/proc/{entry}/stat").read_text().rsplit(")", 1)[1].split()[:2]
+                )
+                if state != "Z":
+                    children.setdefault(int(parent), []).append(int(entry))
+    found, ahead = [], [pid]
+    while ahead:
+        own = children.get(ahead.pop(), [])
+        found += own
+        ahead += own
+    return found
+
+
+def end_descendants(pid: int) -> list[int]:
+    """Kill all processes below `pid`, and return them."""
+    found = descendants(pid)
+    for child in found:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(child, signal.SIGKILL)
+    return found
+
+
+def _reap(pids: Iterable[int]) -> None:
+    """Let go of processes that were killed, as far as they are children of this one."""
+    for pid in pids:
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(pid, 0)
+
+
+def _left_over() -> list[str]:
+    """Return the names of processes that are there after a while, though all commands have ended."""
+    end = time.monotonic() + _GRACE
+    while (there := descendants(os.getpid())) and time.monotonic() < end:
+        time.sleep(0.02)
+    names = []
+    for pid in there:
+        with contextlib.suppress(OSError):
+            names.append(Path(f"/proc/{pid}/comm").read_text().strip())
+    return names
+
+
+def name_of(function: Callable[..., Any]) -> str:
+    """Return the name of a function as words."""
+    return getattr(function, "__name__", "").strip("_").replace("_", " ")
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [""])[0][:200]
