@@ -134,6 +134,17 @@ def test_weights_and_rates_that_are_not_finite_are_refused(make_runner, tmp_path
     assert all(torch.equal(before[key], after[key]) for key in before)
 
 
+def test_an_optimizer_without_the_moments_of_a_parameter_is_refused(make_runner, tmp_path: Path):
+    runner = make_runner()
+    runner.learn(1)
+    runner.save(str(tmp_path / "model_0.pt"))
+    broken = load_checkpoint(tmp_path / "model_0.pt")
+    broken["optimizer_state_dict"]["state"][1] = {}
+    save_checkpoint(broken, tmp_path / "model_0.pt")
+    with pytest.raises(CheckpointError, match="optimizer state"):
+        runner.load(str(tmp_path / "model_0.pt"))
+
+
 @pytest.mark.parametrize("garbage", [7, {}, None, {"a": torch.zeros(2)}])
 @pytest.mark.parametrize(
     "part", ["version", "num_envs", "rng", "observations", "logger", "hidden_states"]

@@ -87,3 +87,32 @@ def test_one_outlier_does_not_hide_the_curve():
 )
 def test_what_a_curve_shows_stays_in_sight(curve):
     assert visible_range(curve) is None
+
+
+def test_a_run_that_was_resumed_before_its_end_has_one_value_for_each_iteration(tmp_path: Path):
+    write_run(tmp_path, {0: 1.0, 1: 2.0, 2: 3.0, 3: 4.0})
+    (first,) = tmp_path.iterdir()
+    first.rename(tmp_path / "events.out.tfevents.0")
+    write_run(tmp_path, {2: 30.0})
+    iterations, values = read_scalars(tmp_path, DEFAULT_TAG)
+    assert iterations.tolist() == [0, 1, 2]
+    assert values.tolist() == [1.0, 2.0, 30.0]
+
+
+@pytest.mark.parametrize("damage", ["flip", "truncate"])
+def test_a_damaged_event_file_is_read_up_to_there_and_told(tmp_path: Path, caplog, damage):
+    write_run(tmp_path, {k: float(k) for k in range(100)})
+    (path,) = tmp_path.iterdir()
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    if damage == "flip":
+        content[middle] ^= 1
+    else:
+        del content[middle:]
+    assert len(read_scalars(tmp_path, DEFAULT_TAG)[0]) == 100
+    assert not caplog.text
+    path.write_bytes(content)
+    iterations, values = read_scalars(tmp_path, DEFAULT_TAG)
+    assert 30 < len(iterations) < 70
+    assert values.tolist() == iterations.tolist()
+    assert str(path) in caplog.text

@@ -50,6 +50,28 @@ def test_defaults_that_have_no_effect_are_silent(run, tmp_path):
     assert "gpu-ids" not in outcome.err
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("gamma", "nan"), ("learning-rate", "inf"), ("entropy-coef", "nan")]
+)
+def test_settings_that_are_not_finite_are_refused(run, tmp_path, name, value):
+    flag = f"--agent.algorithm.{name}"
+    outcome = run("train", TASK, *SMALL, "--log-root", str(tmp_path / "logs"), flag, value)
+    assert outcome.status == 1
+    assert f"{flag}: expected a finite number, got {value}" in outcome.message
+    assert not (tmp_path / "logs").exists()
+
+
+def test_too_little_memory_is_one_message(run, tmp_path, monkeypatch):
+    def build(*args):
+        raise MemoryError
+
+    monkeypatch.setattr("mjlab.scripts.train_run._build_env", build)
+    outcome = run("train", TASK, *SMALL, "--log-root", str(tmp_path))
+    assert outcome.status == 1
+    assert "memory" in outcome.message
+    assert "Traceback" not in outcome.err
+
+
 def test_a_run_that_ends_before_it_learns_is_refused(run, tmp_path):
     flags = ("--log-root", str(tmp_path), "--learner", "sac", "--agent.max-iterations", "1")
     outcome = run("train", TASK, *SMALL, *flags, "--agent.algorithm.learning-starts", "9")

@@ -18,7 +18,7 @@ from mjlab.scripts.cli import UserError
 from mjlab.scripts.nan_page import NanPage
 from mjlab.scripts.viz_nan import VizNanConfig, run_viz_nan
 from mjlab.scripts.viz_nan_run import load_dump
-from mjlab.utils.nan_guard import CHECKED_FIELDS, NanGuard, NanGuardCfg
+from mjlab.utils.nan_guard import CHECKED_FIELDS, NanDump, NanGuard, NanGuardCfg
 
 XML = """
 <mujoco>
@@ -122,15 +122,33 @@ def test_what_cannot_be_shown_is_one_message(run, dump_file: Path, tmp_path: Pat
         run_viz_nan(str(dump_file), VizNanConfig(port=0))
 
 
+def without_digest(dump_file: Path) -> Path:
+    """Return a copy of a dump as releases before wrote it."""
+    dump = NanDump.load(dump_file)
+    metadata = {key: value for key, value in dump.metadata.items() if key != "model_sha256"}
+    older = dump_file.with_name("older.npz")
+    np.savez(older, _metadata=np.array(json.dumps(metadata)), **dump.arrays)
+    return older
+
+
 def test_a_model_that_is_missing_damaged_or_another_is_told(dump_file: Path) -> None:
     model_file = load_dump(str(dump_file))[0].model_file
     content = model_file.read_bytes()
     other = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
     mujoco.mj_saveModel(other, str(model_file))
-    with pytest.raises(UserError, match="not of the same simulation"):
+    with pytest.raises(UserError, match="changed or damaged"):
         load_dump(str(dump_file))
+    # Dumps of before do not say which model is theirs.
+    dump = without_digest(dump_file)
+    with pytest.raises(UserError, match="not of the same simulation"):
+        load_dump(str(dump))
     model_file.write_bytes(content[:100])
     with pytest.raises(UserError, match="cannot be read by MuJoCo"):
+        load_dump(str(dump))
+    flipped = bytearray(content)
+    flipped[len(content) // 2] ^= 1
+    model_file.write_bytes(flipped)
+    with pytest.raises(UserError, match="changed or damaged"):
         load_dump(str(dump_file))
     model_file.unlink()
     with pytest.raises(UserError, match=r"needs its model, model_.*\.mjb"):

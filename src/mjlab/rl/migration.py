@@ -202,7 +202,11 @@ def _optimizer_fits(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) 
         if len(group["params"]) != len(own["params"]) or not isinstance(group["lr"], float):
             return False
         for number, parameter in zip(group["params"], own["params"], strict=True):
-            for value in saved["state"].get(number, {}).values():
+            state = saved["state"].get(number)
+            if state is not None and not state:
+                # torch would begin with new moments, without a word.
+                return False
+            for value in (state or {}).values():
                 is_moment = isinstance(value, torch.Tensor) and value.dim() > 0
                 if is_moment and value.shape != parameter.shape:
                     return False

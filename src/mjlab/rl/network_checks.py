@@ -7,7 +7,15 @@ from typing import Any
 
 import torch
 
-from mjlab.rl.rsl import CNN, PPO, CNNModel, MLPModel, TensorDict, resolve_callable
+from mjlab.rl.rsl import (
+    CNN,
+    PPO,
+    CNNModel,
+    MLPModel,
+    RNNModel,
+    TensorDict,
+    resolve_callable,
+)
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
 
 _MODELS = ("actor", "critic", "student", "teacher")
@@ -116,6 +124,11 @@ def _check_model(
             cnn_cfg = cfg[model].get("cnn_cfg")
             _check_encoders(model, kind, cnn_cfg, {n: groups[n] for n in images})
         return images
+    if cfg[model].get("cnn_cfg") is not None and kind in (MLPModel, RNNModel):
+        raise ValueError(
+            f"agent.{model} cnn_cfg: expected None for class_name {cfg[model]['class_name']!r}, which "
+            f"has no image encoder, got {cfg[model]['cnn_cfg']}; use class_name='CNNModel'."
+        )
     # Models of other packages may take what they like.
     if images and getattr(kind, "_get_obs_dim", None) is MLPModel._get_obs_dim:
         raise ValueError(

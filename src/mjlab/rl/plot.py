@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import logging
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+logger = logging.getLogger(__name__)
 
 DEFAULT_TAG = "Train/mean_step_reward"
 _LABELS = {
@@ -40,29 +43,52 @@ def read_scalars(run_dir: str | Path, tag: str) -> Curve:
 def read_all_scalars(run_dir: str | Path) -> dict[str, Curve]:
     """Return for each tag in the event files of `run_dir` what `read_scalars` does.
 
+    A file that is damaged, or whose writer was killed, is read up to there, and a warning says so.
+
     Raises:
         ValueError: there are no event files.
     """
-    from tensorboard.backend.event_processing import event_accumulator
-
     run_dir = Path(run_dir)
-    if not any(run_dir.glob("events.out.tfevents.*")):
+    paths = sorted(run_dir.glob("events.out.tfevents.*"))
+    if not paths:
         raise ValueError(
             f"There are no TensorBoard event files in {str(run_dir)!r}; give the folder of a run, "
             "such as logs/rsl_rl/<experiment>/<time>."
         )
-    # Zero keeps every value instead of a sample.
-    accumulator = event_accumulator.EventAccumulator(
-        str(run_dir), size_guidance={event_accumulator.SCALARS: 0}
-    )
-    accumulator.Reload()
-    curves = {}
-    for tag in accumulator.Tags()["scalars"]:
-        by_iteration = {event.step: event.value for event in accumulator.Scalars(tag)}
-        iterations = sorted(by_iteration)
-        values = np.array([by_iteration[i] for i in iterations], dtype=float)
-        curves[tag] = (np.array(iterations), values)
-    return curves
+    values: dict[str, dict[int, float]] = {}
+    for path in paths:
+        for tag, step, value in _scalar_events(path):
+            curve = values.setdefault(tag, {})
+            # A run that was resumed goes on from its checkpoint, before where it had got to.
+            while curve and next(reversed(curve)) >= step:
+                curve.popitem()
+            curve[step] = value
+    return {
+        tag: (np.array([*curve]), np.array([*curve.values()], dtype=float))
+        for tag, curve in values.items()
+    }
+
+
+def _scalar_events(path: Path) -> Generator[tuple[str, int, float]]:
+    """Yield tag, step and value of the scalars in an event file."""
+    from tensorboard.backend.event_processing.event_file_loader import RawEventFileLoader
+    from tensorboard.compat.proto import event_pb2
+
+    # Made by protobuf, whose classes have no types.
+    parse: Callable[[bytes], Any] = vars(event_pb2)["Event"].FromString
+    size, read = path.stat().st_size, 0
+    for record in RawEventFileLoader(str(path)).Load():
+        # Length, contents and their checksums.
+        read += len(record) + 16
+        event = parse(record)
+        for value in event.summary.value:
+            if value.HasField("simple_value"):
+                yield value.tag, event.step, value.simple_value
+    if read < size:
+        logger.warning(
+            "The last %d of %d bytes of %s cannot be read: the file is damaged, or its writer was killed.",
+            size - read, size, path,
+        )  # fmt: skip
 
 
 def plot_run(

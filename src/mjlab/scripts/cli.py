@@ -67,6 +67,11 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
         # to go, and Python would complain about it at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
+    except MemoryError:
+        if os.environ.get(TRACEBACK_VARIABLE):
+            traceback.print_exc()
+        print("error: The memory is not enough. Use fewer environments.", file=sys.stderr)
+        sys.exit(1)
     except Exception as error:
         if not isinstance(error, _user_errors()) and not _raised_on_purpose(error):
             raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -95,6 +96,13 @@ def _check_numbers(cfg: TrainConfig) -> None:
     for flag, value in counts.items():
         if value < 1:
             raise UserError(f"{flag.replace('_', '-')} is {value}; it has to be at least 1.")
+    # An infinite bound, as of gradients, is one that is not there.
+    for name, value in vars(agent.algorithm).items():
+        if isinstance(value, float) and (
+            math.isnan(value) or (name.endswith("learning_rate") and math.isinf(value))
+        ):
+            flag = f"--agent.algorithm.{name.replace('_', '-')}"
+            raise UserError(f"{flag}: expected a finite number, got {value}.")
     check_address(cfg.live_host, cfg.live_port, "--live-")
 
 

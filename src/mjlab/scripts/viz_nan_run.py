@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 from dataclasses import dataclass
 
 import mujoco
@@ -63,6 +64,13 @@ def load_dump(path: str) -> tuple[NanDump, mujoco.MjModel]:
         raise UserError(
             f"The dump {path} needs its model, {dump.model_file.name}, in the same folder. Copy "
             "both."
+        )
+    digest = hashlib.sha256(dump.model_file.read_bytes()).hexdigest()
+    # MuJoCo itself reads most damaged models without a word. Earlier dumps do not say.
+    if dump.metadata.get("model_sha256", digest) != digest:
+        raise UserError(
+            f"The model {dump.model_file} is not that of the dump {path}: it was changed or damaged. "
+            "Copy both again."
         )
     try:
         model = mujoco.MjModel.from_binary_path(str(dump.model_file))

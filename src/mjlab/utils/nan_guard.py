@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import os
@@ -185,9 +186,11 @@ class NanGuard:
         if self.model_fields is not None:
             for name, values in self.model_fields().items():
                 arrays[f"model_{name}"] = values[ids].cpu().numpy()
-        arrays["_metadata"] = np.array(json.dumps(self._metadata(nan_ids, ids, stamp, model_path)))
         model = np.empty(mujoco.mj_sizeModel(self.mj_model), np.uint8)
         mujoco.mj_saveModel(self.mj_model, None, model)
+        metadata = self._metadata(nan_ids, ids, stamp, model_path)
+        metadata["model_sha256"] = hashlib.sha256(model.tobytes()).hexdigest()
+        arrays["_metadata"] = np.array(json.dumps(metadata))
         with replacing(model_path) as file:
             file.write(model.tobytes())
         with replacing(path) as file:
