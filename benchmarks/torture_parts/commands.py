@@ -78,6 +78,10 @@ class Ended:
         return f"{self.out}\n{self.err}"
 
 
+# Statuses of commands that end by SIGHUP, SIGINT and SIGTERM in good order.
+_BY_SIGNAL = (129, 130, 143)
+
+
 class Command:
     """A command that runs in a forked process."""
 
@@ -197,7 +201,7 @@ def command(
     return Command(script, argv, before=before).end(patience)
 
 
-def check_end(ended: Ended, *, statuses: Sequence[int] = (0, 1, 2, 130)) -> None:
+def check_end(ended: Ended, *, statuses: Sequence[int] = (0, 1, 2, *_BY_SIGNAL)) -> None:
     """Raise Broken unless a command ended well or said in words why it did not."""
     if ended.stuck:
         raise Broken(ended.stuck)

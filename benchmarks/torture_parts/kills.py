@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -61,7 +62,9 @@ def run(trial: Trial, prepared: dict[str, Any]) -> None:
             own = sorted(set(root.glob("cartpole/*")) - before)
             begun = own[-1] if own and checkpoints(own[-1]) else None
             process.signal(kind)
-            _check_interrupted(process.end(30.0), kind, root, begun)
+            # A killed process cannot remove its folder.
+            left = set(root.glob("cartpole/*")) - before
+            _check_interrupted(process.end(30.0), kind, left, begun)
         else:
             check_end(process.end())
         check_loadable(root)
@@ -82,9 +85,14 @@ def _kill_launcher(trial: Trial) -> None:
     kind = trial.rng.choice((signal.SIGKILL, signal.SIGTERM, signal.SIGHUP))
     trial.trying(f"{kind.name} to train-seeds alone, in its first training")
     root = Path("logs").resolve()
-    process = Command("train_seeds", [*train_flags(root, 100_000), "--seeds", "2"])
+    flags = [*train_flags(root, 100_000), "--seeds", "2"]
+    # The command chooses seeds itself.
+    seed = flags.index("--agent.seed")
+    del flags[seed : seed + 2]
+    process = Command("train_seeds", flags)
     if process.watch(60.0, lambda: bool(checkpoints(root))):
-        os.kill(process.pid, kind)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process.pid, kind)
     process.end(30.0)
     check_loadable(root)
 
@@ -94,10 +102,12 @@ def _start(root: Path, is_fresh: bool) -> Command:
     return Command("train", train_flags(root, _ITERATIONS, *flags), is_fresh=is_fresh)
 
 
-def _check_interrupted(ended: Ended, kind: signal.Signals, root: Path, run: Path | None) -> None:
+def _check_interrupted(
+    ended: Ended, kind: signal.Signals, left: set[Path], run: Path | None
+) -> None:
     """Raise Broken unless a signal that can be answered was, by saving what was learned.
 
-    `run` is the folder of the run if it was in its iterations.
+    `left` are the folders that the process made, `run` is that of the run if it was in its iterations.
     """
     if kind is signal.SIGKILL:
         return
@@ -107,8 +117,8 @@ def _check_interrupted(ended: Ended, kind: signal.Signals, root: Path, run: Path
             raise Broken(f"died of {kind.name} in training, without saving")
     else:
         check_end(ended)
-    for folder in root.glob("cartpole/*"):
-        if not checkpoints(folder):
+    for folder in left:
+        if folder.is_dir() and not checkpoints(folder):
             raise Broken(f"{kind.name} left a run folder without a checkpoint")
     if run and ended.status == 0:
         done = json.loads((run / "run.json").read_text())["iterations"]

@@ -64,8 +64,10 @@ def messages(caplog: Any, part: str) -> list[str]:
     return [record.getMessage() for record in caplog.records if part in record.getMessage()]
 
 
-@pytest.mark.parametrize("kind", ["reward", "termination"])
-@pytest.mark.parametrize("value", [NAN, float("inf")])
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [("reward", NAN), ("reward", float("inf")), ("termination", NAN), ("termination", 0.5)],
+)
 def test_a_term_that_stays_broken_everywhere_ends_training_by_name(make_env, tmp_path, kind, value):
     with pytest.raises(BrokenTermError, match="term 'mine'"):
         learn(make_env(**{kind: everywhere(value)}), tmp_path)

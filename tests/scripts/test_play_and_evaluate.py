@@ -323,3 +323,11 @@ def test_flags_reach_their_fields(config_type, flags, field, value):
 
 def test_the_page_is_served_to_this_machine_only_unless_told_otherwise():
     assert PlayConfig().host == "127.0.0.1"
+
+
+@pytest.mark.parametrize("command", ["play", "evaluate"])
+def test_a_checkpoint_for_an_agent_without_one_is_refused(run, command):
+    outcome = run(command, TASK, "--agent", "random", "--checkpoint-file", "model_1.pt")
+    assert outcome.status == 2
+    assert "--checkpoint-file" in outcome.message
+    assert "--agent random" in outcome.message

@@ -61,9 +61,10 @@ def test_settings_that_are_not_finite_are_refused(run, tmp_path, name, value):
     assert not (tmp_path / "logs").exists()
 
 
-def test_too_little_memory_is_one_message(run, tmp_path, monkeypatch):
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("can't start new thread")])
+def test_too_little_memory_is_one_message(run, tmp_path, monkeypatch, error):
     def build(*args):
-        raise MemoryError
+        raise error
 
     monkeypatch.setattr("mjlab.scripts.train_run._build_env", build)
     outcome = run("train", TASK, *SMALL, "--log-root", str(tmp_path))

@@ -16,17 +16,20 @@ class NonFiniteWatch:
 
     Args:
         labels: Name of each term, as messages have it.
-        counted_as: What such a value counts as, for messages.
+        fault: What is wrong with such a value, and `counted_as` what it counts as, for messages.
         num_envs: Number of environments N.
         device: Device of the values.
 
     Attributes:
+        fault: As given.
         excluded: (N,) bool, environments in which no term is to blame: the physics diverged.
         count: Number of such values in the last step, () int64.
     """
 
-    def __init__(self, labels: Sequence[str], counted_as: str, num_envs: int, device: str) -> None:
-        self._labels, self._counted_as = labels, counted_as
+    def __init__(
+        self, labels: Sequence[str], fault: str, counted_as: str, num_envs: int, device: str
+    ) -> None:
+        self._labels, self.fault, self._counted_as = labels, fault, counted_as
         self._on_cpu = torch.device(device).type == "cpu"
         self.excluded = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self.count = torch.zeros((), dtype=torch.long, device=device)
@@ -70,9 +73,9 @@ class NonFiniteWatch:
                 continue
             self._named.add(k)
             logger.warning(
-                "%s was NaN or infinite in %d of %d environments in step %d, which counts as %s. It is "
-                "not logged again.",
-                self._labels[k], int(self._first_counts[k]), len(self.excluded), step, self._counted_as,
+                "%s was %s in %d of %d environments in step %d, which counts as %s. It is not logged again.",
+                self._labels[k], self.fault, int(self._first_counts[k]), len(self.excluded), step,
+                self._counted_as,
             )  # fmt: skip
 
     def streaks(self) -> dict[str, int]:

@@ -64,7 +64,7 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         self._reward_buf = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._rows = list(self._rates)
         labels = [self._label(name) for name in self._term_names]
-        self.nonfinite = NonFiniteWatch(labels, "0", self.num_envs, self.device)
+        self.nonfinite = NonFiniteWatch(labels, "NaN or infinite", "0", self.num_envs, self.device)
         # Weighted rates (num_envs, terms) of the last step, not multiplied by its duration.
         self._step_reward = self._rates.t()
 

@@ -48,8 +48,11 @@ class TerminationManager(TermListManager):
         self._rows = list(self._values)
         self._terminated, self._time_outs, self._dones = falses(), falses(), falses()
         labels = [self._label(name) for name in self._term_names]
-        self.nonfinite = NonFiniteWatch(labels, "true", self.num_envs, self.device)
-        # Values of terms that return floats, (terms, num_envs), and which terms these are.
+        self.nonfinite = NonFiniteWatch(
+            labels, "neither 0 nor 1", "true", self.num_envs, self.device
+        )
+        # NaN where a term returned a float that is neither 0 nor 1, (terms, num_envs), and the terms
+        # that return floats.
         self._numbers: torch.Tensor | None = None
         self._numeric: set[int] = set()
 
@@ -96,7 +99,7 @@ class TerminationManager(TermListManager):
                 "%s returned %s, expected bool: what is not 0 counts as true. Compare the value in the "
                 "term.", self._label(name), str(value.dtype).removeprefix("torch."),
             )  # fmt: skip
-        self._numbers[k] = value
+        self._numbers[k] = torch.where((value == 0) | (value == 1), 0.0, torch.nan)
 
     def get_term(self, name: str) -> torch.Tensor:
         """Return the last value of a term, (num_envs,) bool.

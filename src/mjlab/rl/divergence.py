@@ -58,8 +58,8 @@ class RolloutWatch:
 
         Raises:
             DivergedError: most environments diverged, in at least 4 episodes.
-            BrokenTermError: a reward or a termination was NaN or infinite in every environment, in every
-                step (of at least 16).
+            BrokenTermError: a reward was NaN or infinite, or a termination a float other than 0 and 1, in
+                every environment and every step (of at least 16).
         """
         if self._resets_before is None:
             return
@@ -79,8 +79,8 @@ class RolloutWatch:
             for term, steps in manager.nonfinite.streaks().items():
                 if steps >= max(num_steps, _MIN_BROKEN_STEPS):
                     raise BrokenTermError(
-                        f"{term} was NaN or infinite in every environment for {steps} steps in a row. "
-                        "Nothing can be learned from it; correct the term, or set it to None."
+                        f"{term} was {manager.nonfinite.fault} in every environment for {steps} steps in a "
+                        "row. Nothing can be learned from it; correct the term, or set it to None."
                     )
 
     @contextmanager

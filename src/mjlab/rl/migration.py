@@ -61,6 +61,9 @@ def _check_types(checkpoint: Mapping[str, Any], path: str) -> None:
     for name, least in _COUNT_ENTRIES.items():
         if name in checkpoint and not _is_count(checkpoint[name], least):
             raise _malformed(path, name, f"a whole number from {least} up", checkpoint[name])
+    owes = checkpoint.get("owes_evaluation", False)
+    if not isinstance(owes, bool):
+        raise _malformed(path, "owes_evaluation", "a bool", owes)
     env_state = (checkpoint.get("infos") or {}).get("env_state")
     if env_state is None:
         return

@@ -124,11 +124,6 @@ def _check_model(
             cnn_cfg = cfg[model].get("cnn_cfg")
             _check_encoders(model, kind, cnn_cfg, {n: groups[n] for n in images})
         return images
-    if cfg[model].get("cnn_cfg") is not None and kind in (MLPModel, RNNModel):
-        raise ValueError(
-            f"agent.{model} cnn_cfg: expected None for class_name {cfg[model]['class_name']!r}, which "
-            f"has no image encoder, got {cfg[model]['cnn_cfg']}; use class_name='CNNModel'."
-        )
     # Models of other packages may take what they like.
     if images and getattr(kind, "_get_obs_dim", None) is MLPModel._get_obs_dim:
         raise ValueError(
@@ -136,6 +131,11 @@ def _check_model(
             f"and its observation group {images[0]!r} holds images of shape "
             f"{tuple(groups[images[0]].shape[1:])}. Give it an image encoder ({_EXAMPLE}), or "
             f"take {images[0]!r} out of obs_groups[{model!r}]."
+        )
+    if cfg[model].get("cnn_cfg") is not None and kind in (MLPModel, RNNModel):
+        raise ValueError(
+            f"agent.{model} cnn_cfg: expected None for class_name {cfg[model]['class_name']!r}, which "
+            f"has no image encoder, got {cfg[model]['cnn_cfg']}; use class_name='CNNModel'."
         )
     return None
 

@@ -127,6 +127,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self.last_evaluation: EvaluationResult | None = None
         self._observations: TensorDict | None = None
         self._state_to_resume: dict[str, Any] | None = None
+        # What was in the run folder when training began: the event file at least.
+        self._first_files: list[Path] = []
         # What the algorithm saves after the last finished iteration.
         self._learned: dict[str, Any] | None = None
         # An evaluation is due after the last iteration, and was left out to stop sooner.
@@ -175,6 +177,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if self._writes and self.logger.log_dir is not None:
             ensure_writable_folder(self.logger.log_dir)
         self.logger.init_logging_writer()
+        if self._writes and self.logger.log_dir is not None:
+            self._first_files = [*Path(self.logger.log_dir).iterdir()]
         self.stop_reason = "failed"
         try:
             with (
@@ -580,7 +584,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     def _check_run_folder(self) -> None:
         """Save the run beside its folder, and raise RunFolderError, if that is gone."""
         folder = self.logger.log_dir
-        if not self._writes or folder is None or os.path.isdir(folder):
+        # Writing an export makes the folder again. What was in it at the beginning is not made again.
+        if not self._writes or folder is None or any(map(os.path.exists, self._first_files)):
             return
         path = self._checkpoint_path(f"{folder}_rescued")
         self.save(path)

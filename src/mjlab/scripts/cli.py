@@ -32,6 +32,15 @@ _LAZY_ERRORS = (
 )
 
 
+# How Python, the loader of libraries and torch, on a CPU and on a GPU, say that there is no memory.
+_OUT_OF_MEMORY = (
+    "can't start new thread",
+    "failed to map segment",
+    "can't allocate memory",
+    "out of memory. Tried to allocate",
+)
+
+
 class UserError(Exception):
     """A mistake in what was asked for, told in one message."""
 
@@ -67,13 +76,11 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
         # to go, and Python would complain about it at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
-    except MemoryError:
-        if os.environ.get(TRACEBACK_VARIABLE):
-            traceback.print_exc()
-        print("error: The memory is not enough. Use fewer environments.", file=sys.stderr)
-        sys.exit(1)
     except Exception as error:
-        if not isinstance(error, _user_errors()) and not _raised_on_purpose(error):
+        if _is_out_of_memory(error):
+            # What was raised says where the memory ended, and not that it did.
+            error = UserError(f"The memory is not enough ({_text(error)}). Use fewer environments.")
+        elif not isinstance(error, _user_errors()) and not _raised_on_purpose(error):
             raise
         if os.environ.get(TRACEBACK_VARIABLE):
             traceback.print_exc()
@@ -85,6 +92,11 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
         status = error.exit_status if isinstance(error, UserError) else 1
         sys.exit(OTHER_PROCESS_STATUS if blameless else status)
     sys.exit(0)
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    said = str(error)
+    return isinstance(error, MemoryError) or any(text in said for text in _OUT_OF_MEMORY)
 
 
 def _print_error(error: BaseException, rank: str) -> None:

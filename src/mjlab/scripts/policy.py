@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import RslRlBaseRunnerCfg, RslRlDistillationRunnerCfg
 from mjlab.rl.learners import Learner, acting_cfg
-from mjlab.scripts.cli import UserError, tell
+from mjlab.scripts.cli import BadCallError, UserError, is_given, tell
 from mjlab.scripts.profiles import parse_with_choices, profile_of_run
 from mjlab.scripts.run_folder import (
     named_checkpoint,
@@ -106,6 +106,7 @@ def parse_policy_flags(
 
     Raises:
         UnknownProfileError: the task has no such profile.
+        BadCallError: a checkpoint is named for an agent that has none.
     """
 
     def make_default(profile: str | None = None, learner: str | None = None) -> F:
@@ -117,12 +118,13 @@ def parse_policy_flags(
         profile = None if "profile" in given else profile_of_policy(task, cfg)
         return {} if profile is None else {"profile": profile}
 
-    return parse_with_choices(
-        make_default,
-        recorded,
-        flags,
-        prog=f"{command} {task}",
-    )
+    cfg = parse_with_choices(make_default, recorded, flags, prog=f"{command} {task}")
+    for flag in ("--checkpoint-file", "--wandb-run-path", "--wandb-checkpoint-name"):
+        if cfg.agent != "trained" and is_given(flag, flags):
+            raise BadCallError(
+                f"{flag}: expected a trained agent, got --agent {cfg.agent}; leave out one of them."
+            )
+    return cfg
 
 
 def make_policy(

@@ -103,7 +103,8 @@ def _check_numbers(cfg: TrainConfig) -> None:
         ):
             flag = f"--agent.algorithm.{name.replace('_', '-')}"
             raise UserError(f"{flag}: expected a finite number, got {value}.")
-    check_address(cfg.live_host, cfg.live_port, "--live-")
+    if cfg.live:
+        check_address(cfg.live_host, cfg.live_port, "--live-")
 
 
 def _check_names(cfg: TrainConfig) -> None:

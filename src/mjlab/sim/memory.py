@@ -58,7 +58,11 @@ def available_memory(device: str) -> int | None:
     On the CPU swap space counts, and the limits of control groups.
     """
     if torch.device(device).type == "cuda":
-        return torch.cuda.mem_get_info(device)[1]
+        try:
+            return torch.cuda.mem_get_info(device)[1]
+        except (RuntimeError, AssertionError):
+            # A device that torch cannot use is refused where it is used.
+            return None
     try:
         lines = [line.split() for line in _MEMORY.read_text().splitlines()]
         sizes = {words[0]: 1024 * int(words[1]) for words in lines if len(words) == 3}
