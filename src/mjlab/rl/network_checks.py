@@ -54,6 +54,14 @@ def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
             images[model] = _check_model(observations, cfg, model, shared)
     if shared:
         _check_sharing(images)
+    for model in images:
+        settings = cfg[model]
+        is_blind = resolve_callable(settings["class_name"]) in (MLPModel, RNNModel)
+        if is_blind and settings.get("cnn_cfg") is not None:
+            raise ValueError(
+                f"agent.{model} cnn_cfg: expected None for class_name {settings['class_name']!r}, which "
+                f"has no image encoder, got {settings['cnn_cfg']}; use class_name='CNNModel'."
+            )
 
 
 def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:
@@ -131,11 +139,6 @@ def _check_model(
             f"and its observation group {images[0]!r} holds images of shape "
             f"{tuple(groups[images[0]].shape[1:])}. Give it an image encoder ({_EXAMPLE}), or "
             f"take {images[0]!r} out of obs_groups[{model!r}]."
-        )
-    if cfg[model].get("cnn_cfg") is not None and kind in (MLPModel, RNNModel):
-        raise ValueError(
-            f"agent.{model} cnn_cfg: expected None for class_name {cfg[model]['class_name']!r}, which "
-            f"has no image encoder, got {cfg[model]['cnn_cfg']}; use class_name='CNNModel'."
         )
     return None
 
