@@ -32,7 +32,7 @@ def attempt(run, tmp_path):
 @pytest.mark.parametrize(
     ("flag", "value", "told"),
     [
-        ("--agent.algorithm.learning-rate", "nan", "learning rate"),
+        ("--agent.algorithm.learning-rate", "nan", "learning-rate"),
         ("--agent.actor.activation", "unheard-of", "unheard-of"),
         ("--num-envs", "0", "num_envs"),
     ],

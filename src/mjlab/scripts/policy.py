@@ -119,7 +119,8 @@ def parse_policy_flags(
         return {} if profile is None else {"profile": profile}
 
     cfg = parse_with_choices(make_default, recorded, flags, prog=f"{command} {task}")
-    for flag in ("--checkpoint-file", "--wandb-run-path", "--wandb-checkpoint-name"):
+    # A task may read more than a policy from a run at Weights & Biases.
+    for flag in ("--checkpoint-file", "--wandb-checkpoint-name"):
         if cfg.agent != "trained" and is_given(flag, flags):
             raise BadCallError(
                 f"{flag}: expected a trained agent, got --agent {cfg.agent}; leave out one of them."
