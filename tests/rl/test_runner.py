@@ -283,7 +283,10 @@ def test_an_error_does_not_replace_a_checkpoint_that_resumes_exactly(
     assert (tmp_path / "run" / "model_0.pt").read_bytes() == whole
 
 
-def test_a_run_whose_folder_is_gone_is_saved_beside_it(make_runner, tmp_path: Path):
+@pytest.mark.parametrize("made_again", [False, True])
+def test_a_run_whose_folder_is_gone_is_saved_beside_it(
+    make_runner, tmp_path: Path, made_again: bool
+):
     straight = make_runner(tmp_path / "straight")
     straight.learn(4)
     expected = everything(straight)
@@ -293,6 +296,8 @@ def test_a_run_whose_folder_is_gone_is_saved_beside_it(make_runner, tmp_path: Pa
         def on_iteration(self, stats):
             if stats.iteration == 2:
                 folder.rename(tmp_path / "moved")
+                if made_again:
+                    folder.mkdir()
 
     runner = make_runner(folder)
     runner.observers.append(Move())
@@ -301,7 +306,6 @@ def test_a_run_whose_folder_is_gone_is_saved_beside_it(make_runner, tmp_path: Pa
     rescued = tmp_path / "run_rescued" / "model_1.pt"
     assert str(folder) in str(caught.value)
     assert str(rescued) in str(caught.value)
-    assert not folder.exists()
     resumed = make_runner(tmp_path / "resumed")
     resumed.load(str(rescued))
     resumed.learn(4)

@@ -127,8 +127,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self.last_evaluation: EvaluationResult | None = None
         self._observations: TensorDict | None = None
         self._state_to_resume: dict[str, Any] | None = None
-        # What was in the run folder when training began: the event file at least.
-        self._first_files: list[Path] = []
+        # Descriptor of the run folder, while training.
+        self._run_folder: int | None = None
         # What the algorithm saves after the last finished iteration.
         self._learned: dict[str, Any] | None = None
         # An evaluation is due after the last iteration, and was left out to stop sooner.
@@ -177,13 +177,12 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if self._writes and self.logger.log_dir is not None:
             ensure_writable_folder(self.logger.log_dir)
         self.logger.init_logging_writer()
-        if self._writes and self.logger.log_dir is not None:
-            self._first_files = [*Path(self.logger.log_dir).iterdir()]
         self.stop_reason = "failed"
         try:
             with (
                 using_torch_threads(self._num_threads),
                 StopRequest(lambda name: self._tell("on_stop_requested", name)) as stop,
+                self._holding_run_folder(),
             ):
                 observations = self._start(init_at_random_ep_len)
                 self._tell("on_start", first, num_learning_iterations)
@@ -581,12 +580,29 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     def _checkpoint_path(self, folder: str) -> str:
         return os.path.join(folder, f"model_{self.current_learning_iteration - 1}.pt")
 
+    @contextlib.contextmanager
+    def _holding_run_folder(self) -> Generator[None]:
+        """Keep the run folder open, so that another one of its name can be told from it."""
+        if self._writes and self.logger.log_dir is not None:
+            # Windows opens no folders, and deletes none in which a file is open.
+            with contextlib.suppress(PermissionError):
+                self._run_folder = os.open(self.logger.log_dir, os.O_RDONLY)
+        try:
+            yield
+        finally:
+            if self._run_folder is not None:
+                os.close(self._run_folder)
+                self._run_folder = None
+
     def _check_run_folder(self) -> None:
         """Save the run beside its folder, and raise RunFolderError, if that is gone."""
         folder = self.logger.log_dir
-        # Writing an export makes the folder again. What was in it at the beginning is not made again.
-        if not self._writes or folder is None or any(map(os.path.exists, self._first_files)):
+        if self._run_folder is None or folder is None:
             return
+        # Whoever writes next, such as TensorBoard, makes another folder of that name.
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(self._run_folder), os.stat(folder)):
+                return
         path = self._checkpoint_path(f"{folder}_rescued")
         self.save(path)
         raise RunFolderError(

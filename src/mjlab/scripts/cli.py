@@ -32,11 +32,12 @@ _LAZY_ERRORS = (
 )
 
 
-# How Python, the loader of libraries and torch, on a CPU and on a GPU, say that there is no memory.
+# How Python, the loader of libraries, MuJoCo and torch, on a CPU and a GPU, say that memory is short.
 _OUT_OF_MEMORY = (
     "can't start new thread",
     "failed to map segment",
     "can't allocate memory",
+    "Could not allocate memory",
     "out of memory. Tried to allocate",
 )
 
