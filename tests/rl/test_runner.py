@@ -232,7 +232,7 @@ def test_a_process_that_ignores_hangups_trains_on(make_runner, tmp_path: Path):
     assert runner.stop_reason == "finished"
 
 
-@pytest.mark.parametrize("place", ["term", "update"])
+@pytest.mark.parametrize("place", ["term", "update", "report"])
 def test_an_error_leaves_what_was_learned_before_it(
     make_runner, tmp_path: Path, monkeypatch, caplog, place
 ):
@@ -252,7 +252,14 @@ def test_an_error_leaves_what_was_learned_before_it(
             raise ZeroDivisionError("in a term")
         return step(actions)
 
-    if place == "update":
+    def broken_report(iteration, *args):
+        raise ZeroDivisionError("in an observer")
+
+    if place == "report":
+        runner.learn(3)
+        (tmp_path / "run" / "model_2.pt").unlink()
+        monkeypatch.setattr(runner, "_report", broken_report)
+    elif place == "update":
         monkeypatch.setattr(runner.alg, "update", broken_update)
     else:
         monkeypatch.setattr(runner.env, "step", broken_step)

@@ -226,7 +226,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 return reason
         for iteration in range(first, total):
             begin = time.perf_counter()
-            self._learned = copy.deepcopy(self.alg.save())
+            self._learned = {**copy.deepcopy(self.alg.save()), **self._progress()}
             with self._watch.explaining(self.alg.get_policy()):
                 with torch.inference_mode():
                     with using_torch_threads(self._num_collecting_threads):
@@ -619,23 +619,23 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             raise
         except Exception:
             folder = self.logger.log_dir
-            learned, done = self._learned, self.current_learning_iteration
-            if learned is not None and done > 0 and self._writes and folder is not None:
-                path = self._checkpoint_path(folder)
+            learned = self._learned
+            if learned and learned["iterations_finished"] and self._writes and folder is not None:
+                path = os.path.join(folder, f"model_{learned['iter']}.pt")
                 if not os.path.exists(path):
                     self._save_learned(learned, path)
             raise
 
     def _save_learned(self, learned: dict[str, Any], path: str) -> None:
         try:
-            save_checkpoint({**learned, **self._progress()}, path)
+            save_checkpoint(learned, path)
         except CheckpointError as error:
             # What failed first is what the user has to know.
             logger.warning("%s", error)
             return
         logger.warning(
             "Training failed in iteration %d. Weights and optimizer of before are in %s; a run that is "
-            "resumed from there starts in new episodes.", self.current_learning_iteration + 1, path,
+            "resumed from there starts in new episodes.", learned["iterations_finished"] + 1, path,
         )  # fmt: skip
 
     # Export.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
 import sys
@@ -120,7 +121,8 @@ def _let_go_of_the_terminal() -> None:
 
     Otherwise the next line would raise, before there is a checkpoint.
     """
-    with open(os.devnull, "wb") as nowhere:
+    # In a signal handler nothing may be raised, such as for a descriptor that is closed.
+    with open(os.devnull, "wb") as nowhere, contextlib.suppress(OSError):
         for number in (1, 2):
             # A terminal that was closed is none to `isatty`, but still a character device.
             if stat.S_ISCHR(os.fstat(number).st_mode):
