@@ -72,9 +72,33 @@ def test_states_beyond_the_limit_of_mujoco_reach_no_reward(engine):
     env.close()
 
 
+@pytest.mark.parametrize("dof", [0, 1])
+@pytest.mark.parametrize("engine", ["native", "warp"])
+def test_accelerations_beyond_the_limit_of_mujoco_end_the_episode(engine, dof, caplog):
+    """With velocities that are within it, at each degree of freedom."""
+    pytest.importorskip("mujoco_warp")
+    env = make_env(engine)
+    mass = (3e11, 3e10)[dof]
+    env.sim.data.qfrc_applied[BROKEN, dof] = mass
+    _, reward, terminated, *_ = env.step(actions(1)[0])
+    assert env.sim.data.qvel.abs().max() < 1e10
+    assert terminated.tolist() == [index == BROKEN for index in range(NUM_ENVS)]
+    assert reward[BROKEN] == 0
+    assert "joint 'cartpole/" in caplog.text
+    env.close()
+
+
+def test_metrics_leave_out_what_diverged(env):
+    log = env.metrics_manager
+    assert log.excluded is None
+    env.sim.data.qvel[BROKEN] = 1e15
+    env.step(actions(1)[0])
+    assert log.excluded.tolist() == [index == BROKEN for index in range(NUM_ENVS)]
+
+
 @pytest.mark.parametrize(
     ("field", "value", "named"),
-    [("qpos", float("nan"), "not finite"), ("qvel", 1e15, "joint 'cartpole/hinge_1'")],
+    [("qpos", float("nan"), "joint 'cartpole/"), ("qvel", 1e15, "joint 'cartpole/hinge_1'")],
 )
 def test_the_first_divergence_is_logged_with_environment_and_joint(
     env, caplog, field, value, named

@@ -107,3 +107,22 @@ def test_environments_that_diverged_are_not_blamed_on_terms(make_env, caplog):
     assert extras["log"]["Simulation/nan_rewards"] == 0
     assert reward[1] == 0
     assert not messages(caplog, "NaN or infinite")
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_steps_in_and_out_of_inference_mode_may_follow_each_other(make_env, first):
+    def broken_once(env: Any) -> torch.Tensor:
+        return torch.full((env.num_envs,), NAN if env.common_step_counter == 1 else 1.0)
+
+    env = make_env(reward=broken_once, termination=lambda env: torch.zeros(env.num_envs))
+    for inference in (first, not first, first, not first):
+        with torch.inference_mode(inference):
+            env.step(torch.zeros(NUM_ENVS, 1))
+
+
+def test_a_broken_term_is_not_told_as_diverged_physics(make_env, tmp_path):
+    env = make_env(reward=everywhere(NAN))
+    # Too fast for a time step to resolve, and not bad to MuJoCo.
+    env.sim.data.qvel[:, 1] = 1e4
+    with pytest.raises(BrokenTermError, match="term 'mine'"):
+        learn(env, tmp_path)

@@ -111,8 +111,13 @@ def test_a_flipped_bit_is_refused_or_changes_nothing(tmp_path: Path):
     assert refused > 100
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-@pytest.mark.parametrize("part", ["actor_state_dict", "critic_state_dict", "moment", "lr"])
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [
+        *[(part, float("nan")) for part in ("actor_state_dict", "critic_state_dict", "moment")],
+        *[(part, float("inf")) for part in ("actor_state_dict", "critic_state_dict", "lr")],
+    ],
+)
 def test_weights_and_rates_that_are_not_finite_are_refused(make_runner, tmp_path, part, value):
     runner = make_runner()
     runner.learn(1)

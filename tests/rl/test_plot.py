@@ -81,6 +81,7 @@ def test_one_outlier_does_not_hide_the_curve():
         np.linspace(0.0, 1.0, 50),
         np.concatenate([np.zeros(95), np.full(5, 900.0)]),
         np.array([1.0, 1e9]),
+        np.array([0.0, 10.0, 10.1, 20.0]),
         np.full(20, 3.0),
         np.array([]),
     ],

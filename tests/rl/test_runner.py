@@ -239,7 +239,7 @@ def test_an_error_leaves_what_was_learned_before_it(
     straight = make_runner(tmp_path / "straight", save_interval=100)
     straight.learn(3)
     runner = make_runner(tmp_path / "run", save_interval=100)
-    update, step = runner.alg.update, runner.env.step
+    update, step, report = runner.alg.update, runner.env.step, runner._report
 
     def broken_update():
         losses = update()
@@ -253,11 +253,11 @@ def test_an_error_leaves_what_was_learned_before_it(
         return step(actions)
 
     def broken_report(iteration, *args):
-        raise ZeroDivisionError("in an observer")
+        if iteration == 3:
+            raise ZeroDivisionError("in an observer")
+        return report(iteration, *args)
 
     if place == "report":
-        runner.learn(3)
-        (tmp_path / "run" / "model_2.pt").unlink()
         monkeypatch.setattr(runner, "_report", broken_report)
     elif place == "update":
         monkeypatch.setattr(runner.alg, "update", broken_update)
@@ -276,6 +276,37 @@ def test_an_error_leaves_what_was_learned_before_it(
     states = [learner.alg.optimizer.state_dict()["state"] for learner in (resumed, straight)]
     assert_same_bits(states[0][0], states[1][0])
     resumed.learn(4)
+
+
+def test_weights_that_are_nan_are_not_saved_after_the_error_that_they_cause(
+    make_runner, tmp_path: Path, monkeypatch
+):
+    runner = make_runner(tmp_path / "run", save_interval=100)
+    update = runner.alg.update
+
+    def breaking_update():
+        losses = update()
+        if runner.current_learning_iteration == 2:
+            with torch.no_grad():
+                next(runner.alg.get_policy().parameters()).fill_(float("nan"))
+        return losses
+
+    monkeypatch.setattr(runner.alg, "update", breaking_update)
+    with pytest.raises((RuntimeError, ValueError)):
+        runner.learn(6)
+    assert [path.name for path in (tmp_path / "run").glob("model_*")] == ["model_0.pt"]
+
+
+def test_an_error_right_after_a_resume_leaves_the_exact_checkpoint_the_newest(
+    make_runner, tmp_path: Path, monkeypatch
+):
+    make_runner(tmp_path / "first").learn(2)
+    resumed = make_runner(tmp_path / "second")
+    resumed.load(str(tmp_path / "first" / "model_1.pt"))
+    monkeypatch.setattr(resumed.alg, "update", lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        resumed.learn(4)
+    assert not list((tmp_path / "second").glob("model_*"))
 
 
 def test_an_error_does_not_replace_a_checkpoint_that_resumes_exactly(

@@ -141,3 +141,23 @@ def test_a_signal_while_building_leaves_no_folder(tmp_path, number):
     assert done.returncode == 128 + number
     assert "Traceback" not in done.stderr
     assert list((tmp_path / "cartpole").iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no signals to groups of processes")
+def test_a_signal_that_ends_the_reader_of_a_pipe_first_leaves_a_checkpoint(tmp_path):
+    log_root = tmp_path / "logs"
+    process = subprocess.Popen(
+        endless_run(log_root), stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    assert process.stdout is not None
+    end = time.monotonic() + PATIENCE
+    while not list(log_root.glob("cartpole/*/model_0.pt")) and time.monotonic() < end:
+        time.sleep(0.01)
+    # As `train | tee log`, when Ctrl-C ends `tee`.
+    process.stdout.close()
+    process.send_signal(signal.SIGINT)
+    process.wait(PATIENCE)
+    (run_dir,) = (log_root / "cartpole").iterdir()
+    info = read_run_info(run_dir)
+    assert info["ended"] == "interrupted"
+    assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"

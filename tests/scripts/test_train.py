@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
 import pytest
 import torch
 import yaml
@@ -209,11 +210,15 @@ def test_a_state_that_turns_nan_is_counted_and_the_run_goes_on(run, tmp_path, mo
 
 def test_physics_that_diverges_nearly_everywhere_ends_training(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    # Other libraries of this process set one, dm_control as it is imported.
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(None)
     outcome = run(
         "train", TASK, "--num-envs", "16", "--device", "cpu", "--agent.max-iterations", "2",
         "--env.sim.mujoco.timestep", "100", "--env.episode-length-s", "1e5",
         "--env.sim.mujoco.integrator", "euler", "--log-root", str(tmp_path / "logs"),
     )  # fmt: skip
+    mujoco.set_mju_user_warning(handler)
     assert outcome.status == 1
     assert "diverged" in outcome.err
     assert "timestep" in outcome.err

@@ -26,6 +26,7 @@ from mjlab.utils.os import (
     own_folder,
     remove_temporary_files,
     replacing,
+    temporary_path,
 )
 
 
@@ -342,3 +343,14 @@ def test_a_temporary_file_is_removed_once_its_process_was_killed_and_not_before(
         remove_temporary_files(tmp_path)
         file.write(b"whole")
     assert (tmp_path / "model_3.pt").read_bytes() == b"whole"
+
+
+def test_temporary_files_of_other_machines_are_kept_for_a_day(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("socket.gethostname", lambda: "elsewhere")
+    new, old = (temporary_path(tmp_path / name) for name in ("new.pt", "old.pt"))
+    monkeypatch.undo()
+    for path in (new, old):
+        path.touch()
+    os.utime(old, (1e9, 1e9))
+    remove_temporary_files(tmp_path)
+    assert [*tmp_path.iterdir()] == [new]

@@ -62,6 +62,9 @@ class DivergenceLog:
             velocity = self._velocities[env]
         speeds = velocity.abs().tolist()
         dof, motion = fastest_dof(model, speeds)
+        if motion <= 1.0 and (found := self._sim.bad_dof(env)) is not None:
+            name = model.joint(int(model.dof_jntid[found])).name
+            return f"MuJoCo found the state of joint {name!r} bad", cure_of(model, found)
         if motion <= 1.0:
             # Within the step, or something wrote such a state.
             return "its state is not finite", (

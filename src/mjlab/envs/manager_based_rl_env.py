@@ -351,7 +351,10 @@ class ManagerBasedRlEnv:
         self.reset_time_outs = self.termination_manager.time_outs
         self._terminate_diverged()
         self.reward_buf = self.reward_manager.compute(dt=self.step_dt)
+        # Also what a subclass of the manager adds.
+        self.reward_buf.masked_fill_(self.diverged, 0.0)
         self._log_not_finite()
+        self.metrics_manager.excluded = self.diverged
         self.metrics_manager.compute()
         self._look_ahead()
         self._divergence_log.end_step(self.diverged, self.common_step_counter)

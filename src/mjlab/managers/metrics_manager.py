@@ -39,7 +39,7 @@ class MetricsManager(TermListManager):
     """
 
     _cfg_type = MetricsTermCfg
-    _transient = {"_rows", "_substep_rows", "_terms_by_reduce"}
+    _transient = {"_rows", "_substep_rows", "_terms_by_reduce", "excluded"}
 
     def __init__(self, cfg: Mapping[str, MetricsTermCfg | None], env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
@@ -49,6 +49,8 @@ class MetricsManager(TermListManager):
         self._max = torch.full(size, -torch.inf, dtype=torch.float32, device=self.device)
         self._steps = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._rows = list(self._last)
+        # (num_envs,) bool, environments whose physics diverged in the step.
+        self.excluded: torch.Tensor | None = None
         substep_terms = [k for k, c in enumerate(self._term_cfgs) if c.per_substep]
         self._substep_sums = torch.zeros(
             len(substep_terms), self.num_envs, dtype=torch.float32, device=self.device
@@ -83,6 +85,9 @@ class MetricsManager(TermListManager):
         if self._substep_rows:
             self._substep_sums.zero_()
             self._substeps = 0
+        if self.excluded is not None:
+            # Means leave out what is NaN.
+            self._last.masked_fill_(self.excluded, torch.nan)
         self._sum.add_(self._last)
         if "max" in self._terms_by_reduce:
             torch.maximum(self._max, self._last, out=self._max)

@@ -50,7 +50,8 @@ class NonFiniteWatch:
         """Return where values (terms, N) of a step are NaN or infinite; on a CPU, None if nowhere."""
         # One number tells for nearly every step that all is well.
         if self._on_cpu and math.isfinite(values.sum().item()):
-            self._streaks.zero_()
+            # Not in place: it may have been made in inference mode.
+            self._streaks = torch.zeros_like(self._streaks)
             return None
         bad = ~torch.isfinite(values)
         told = bad & ~self.excluded

@@ -87,6 +87,7 @@ class NullMetricsManager(NullManager):
     """Stands in where there are no metrics."""
 
     needs_substep = False
+    excluded: torch.Tensor | None = None
 
     def compute(self) -> None:
         """Do nothing."""

@@ -34,7 +34,7 @@ class TerminationManager(TermListManager):
     """Decides which episodes end. All results are buffers that the next step overwrites."""
 
     _cfg_type = TerminationTermCfg
-    _transient = {"_rows", "_numbers", "_numeric", "nonfinite"}
+    _transient = {"_rows", "_numeric", "nonfinite"}
 
     def __init__(
         self, cfg: Mapping[str, TerminationTermCfg | None], env: ManagerBasedRlEnv
@@ -51,10 +51,8 @@ class TerminationManager(TermListManager):
         self.nonfinite = NonFiniteWatch(
             labels, "neither 0 nor 1", "true", self.num_envs, self.device
         )
-        # NaN where a term returned a float that is neither 0 nor 1, (terms, num_envs), and the terms
-        # that return floats.
-        self._numbers: torch.Tensor | None = None
-        self._numeric: set[int] = set()
+        # Of terms that return floats: NaN where it is neither 0 nor 1, else 0, (num_envs,).
+        self._numeric: dict[int, torch.Tensor] = {}
 
     @property
     def dones(self) -> torch.Tensor:
@@ -86,20 +84,19 @@ class TerminationManager(TermListManager):
                 self._take_numbers(k, name, value)
             row.copy_(value)
             (self._time_outs if cfg.time_out else self._terminated).logical_or_(row)
-        if self._numbers is not None:
-            self.nonfinite.look(self._numbers)
+        if self._numeric:
+            none = torch.zeros(self.num_envs, device=self.device)
+            rows = [self._numeric.get(k, none) for k in range(len(self._term_names))]
+            self.nonfinite.look(torch.stack(rows))
         return torch.logical_or(self._terminated, self._time_outs, out=self._dones)
 
     def _take_numbers(self, k: int, name: str, value: torch.Tensor) -> None:
-        if self._numbers is None:
-            self._numbers = torch.zeros(self._values.shape, device=self.device)
         if k not in self._numeric:
-            self._numeric.add(k)
             logger.warning(
                 "%s returned %s, expected bool: what is not 0 counts as true. Compare the value in the "
                 "term.", self._label(name), str(value.dtype).removeprefix("torch."),
             )  # fmt: skip
-        self._numbers[k] = torch.where((value == 0) | (value == 1), 0.0, torch.nan)
+        self._numeric[k] = torch.where((value == 0) | (value == 1), 0.0, torch.nan)
 
     def get_term(self, name: str) -> torch.Tensor:
         """Return the last value of a term, (num_envs,) bool.

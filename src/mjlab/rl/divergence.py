@@ -91,6 +91,8 @@ class RolloutWatch:
         """
         try:
             yield
+        except (DivergedError, BrokenTermError):
+            raise
         except (RuntimeError, ValueError) as error:
             message = self._explanation() if _is_about_numbers(error, policy) else None
             if message is None:

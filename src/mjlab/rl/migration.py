@@ -22,7 +22,7 @@ _DICT_ENTRIES = (
     "teacher_state_dict", "optimizer_state_dict", "rnd_state_dict", "rnd_optimizer_state_dict",
     "infos", "training_state",
 )  # fmt: skip
-# Entries in which nothing is ever infinite.
+# Entries of learning, beside the networks.
 _LEARNING_ENTRIES = ("optimizer_state_dict", "rnd_optimizer_state_dict", "sac_state_dict")
 _COUNT_ENTRIES = {"iter": -1, "iterations_finished": 0, "last_evaluated": 0}
 
@@ -168,33 +168,33 @@ def check_optimizer_fits(
 
 
 def check_finite(checkpoint: Mapping[str, Any], path: str) -> None:
-    """Check the states of optimizers and of SAC, learning rates among them.
+    """Check the states of optimizers and of SAC.
 
     Raises:
-        CheckpointError: something is NaN or infinite.
+        CheckpointError: tensors are NaN, or learning rates not finite.
     """
-    for name in _LEARNING_ENTRIES:
-        broken = _not_finite(checkpoint.get(name), name)
-        if broken:
-            raise CheckpointError(
-                f"The checkpoint {path!r} holds values that are NaN or infinite: {', '.join(broken)}. "
-                "Use an earlier one; nothing was changed."
-            )
+    broken = not_finite({name: checkpoint.get(name) for name in _LEARNING_ENTRIES})
+    if broken:
+        raise CheckpointError(
+            f"The checkpoint {path!r} holds values that are NaN or infinite: {', '.join(broken)}. "
+            "Use an earlier one; nothing was changed."
+        )
 
 
-def _not_finite(value: Any, name: str) -> list[str]:
-    """Return the names of tensors and numbers within `value` that are NaN or infinite."""
+def not_finite(value: Any, name: str = "") -> list[str]:
+    """Return the names of tensors within `value` that hold NaN, and of learning rates not finite."""
     if isinstance(value, torch.Tensor):
-        return [] if _is_finite(value) else [name]
+        return [name] if bool(value.isnan().any()) else []
     if isinstance(value, float):
-        return [] if math.isfinite(value) else [name]
+        return [name] if name.endswith(".lr") and not math.isfinite(value) else []
     if isinstance(value, dict):
         items = value.items()
     elif isinstance(value, (list, tuple)):
         items = enumerate(value)
     else:
         return []
-    return [found for key, item in items for found in _not_finite(item, f"{name}.{key}")]
+    prefix = f"{name}." if name else ""
+    return [found for key, item in items for found in not_finite(item, f"{prefix}{key}")]
 
 
 def _optimizer_fits(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> bool:

@@ -219,11 +219,11 @@ def visible_range(values: np.ndarray) -> tuple[float, float] | None:
     """Return the range of an axis that one value in a hundred would blow up; None if none does.
 
     It is that of the values without the highest and the lowest hundredth, at least one of each, if the
-    range of all is 20 times as wide. Values that are not finite do not count.
+    range of all is 20 times as wide. Values that are not finite do not count. Of fewer than 50, all do.
     """
     values = np.sort(values[np.isfinite(values)])
     cut = max(1, len(values) // 100)
-    if len(values) < 2 * cut + 2:
+    if len(values) < 50:
         return None
     low, high = float(values[cut]), float(values[-cut - 1])
     if not 0 < 20 * (high - low) < values[-1] - values[0]:

@@ -104,7 +104,7 @@ class RunLogger(Logger):
             self._keep_code_state(Path(self.log_dir))
         for line in filter(None, printed.getvalue().splitlines()):
             logger.debug("%s", line)
-        if self.writer is not None:
+        if self.writer is not None and threading.excepthook != self._on_thread_error:
             self._thread_hook = threading.excepthook
             threading.excepthook = self._on_thread_error
 
@@ -347,11 +347,11 @@ def _writer_config(wanted: str | dict[str, Any], cfg: dict[str, Any]) -> str | d
     """Return what rsl_rl makes the writer from."""
     if wanted == "wandb":
         wanted = {"class_name": "WandbLogWriter", "project_name": cfg.get("wandb_project")}
-    if not cfg.get("upload_git_diff", False):
-        # wandb makes a difference of its own, of the repository around the working folder.
-        os.environ.setdefault("WANDB_DISABLE_CODE", "true")
     if isinstance(wanted, dict) and wanted.get("class_name") == "WandbLogWriter":
         enable_wandb()
+        if not cfg.get("upload_git_diff", False):
+            # wandb makes a difference of its own, of the repository around the working folder.
+            os.environ.setdefault("WANDB_DISABLE_CODE", "true")
     return wanted
 
 

@@ -37,7 +37,13 @@ from mjlab.rl.image_encoders import (
     shared_parameters_allowed,
     train_once,
 )
-from mjlab.rl.migration import check_finite, check_fits, check_optimizer_fits, migrate
+from mjlab.rl.migration import (
+    check_finite,
+    check_fits,
+    check_optimizer_fits,
+    migrate,
+    not_finite,
+)
 from mjlab.rl.network_checks import check_mini_batches, check_networks
 from mjlab.rl.onnx_export import export_to_onnx
 from mjlab.rl.progress import IterationStats, TrainingObserver
@@ -129,7 +135,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self._state_to_resume: dict[str, Any] | None = None
         # Descriptor of the run folder, while training.
         self._run_folder: int | None = None
-        # What the algorithm saves after the last finished iteration.
+        # What the algorithm saves after the last iteration that was finished since `learn` began.
         self._learned: dict[str, Any] | None = None
         # An evaluation is due after the last iteration, and was left out to stop sooner.
         self._owes_evaluation = False
@@ -177,7 +183,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if self._writes and self.logger.log_dir is not None:
             ensure_writable_folder(self.logger.log_dir)
         self.logger.init_logging_writer()
-        self.stop_reason = "failed"
+        self.stop_reason, self._learned = "failed", None
         try:
             with (
                 using_torch_threads(self._num_threads),
@@ -226,7 +232,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 return reason
         for iteration in range(first, total):
             begin = time.perf_counter()
-            self._learned = {**copy.deepcopy(self.alg.save()), **self._progress()}
+            if self._writes and self.logger.log_dir is not None and iteration > first:
+                self._learned = {**copy.deepcopy(self.alg.save()), **self._progress()}
             with self._watch.explaining(self.alg.get_policy()):
                 with torch.inference_mode():
                     with using_torch_threads(self._num_collecting_threads):
@@ -600,10 +607,10 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if self._run_folder is None or folder is None:
             return
         # Whoever writes next, such as TensorBoard, makes another folder of that name.
-        with contextlib.suppress(FileNotFoundError):
+        with contextlib.suppress(OSError):
             if os.path.samestat(os.fstat(self._run_folder), os.stat(folder)):
                 return
-        path = self._checkpoint_path(f"{folder}_rescued")
+        path = self._checkpoint_path(f"{os.path.normpath(folder)}_rescued")
         self.save(path)
         raise RunFolderError(
             f"The run folder {folder!r} is no longer there: it was deleted or moved while the run was "
@@ -620,9 +627,10 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         except Exception:
             folder = self.logger.log_dir
             learned = self._learned
-            if learned and learned["iterations_finished"] and self._writes and folder is not None:
+            if learned is not None and folder is not None:
                 path = os.path.join(folder, f"model_{learned['iter']}.pt")
-                if not os.path.exists(path):
+                # Weights that are NaN may be why training failed, and could not be loaded again.
+                if not os.path.exists(path) and not not_finite(learned):
                     self._save_learned(learned, path)
             raise
 

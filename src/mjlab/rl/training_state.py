@@ -50,6 +50,8 @@ def restore(
     """
     try:
         return _restore(state, env, algorithm, run_logger)
+    except torch.OutOfMemoryError:
+        raise
     except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
         raise CheckpointError(
             f"The checkpoint's training_state is malformed ({type(error).__name__}: {error}). Use an "
@@ -81,8 +83,6 @@ def _restore(
     device = run_logger.device
     run_logger.load_state_dict(state["logger"])
     for model, hidden in zip(_models(algorithm), state["hidden_states"], strict=True):
-        if (hidden is not None) != bool(getattr(model, "is_recurrent", False)):
-            raise TypeError("hidden_states are not those of these networks")
         if hidden is not None:
             model.reset(hidden_state=_as_tuples(_to(hidden, device)))
     if hasattr(algorithm, "last_hidden_states"):

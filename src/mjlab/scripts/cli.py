@@ -80,7 +80,10 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
     except Exception as error:
         if _is_out_of_memory(error):
             # What was raised says where the memory ended, and not that it did.
-            error = UserError(f"The memory is not enough ({_text(error)}). Use fewer environments.")
+            error = UserError(
+                f"Memory or threads are not enough ({_text(error)}). Use fewer environments, or raise "
+                "the limits (ulimit)."
+            )
         elif not isinstance(error, _user_errors()) and not _raised_on_purpose(error):
             raise
         if os.environ.get(TRACEBACK_VARIABLE):

@@ -7,6 +7,7 @@ import os
 import stat
 import sys
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from rich.console import Console, Group
@@ -24,11 +25,20 @@ if TYPE_CHECKING:
 _SECONDS_BETWEEN_LINES = 5.0
 
 
+class _LastingConsole(Console):
+    """A console whose reader may leave: `train | tee log` saves although Ctrl-C ends `tee` first."""
+
+    def on_broken_pipe(self) -> None:
+        """Send what follows nowhere."""
+        pipe = os.fstat(1)
+        _let_go_of(lambda file: os.path.samestat(file, pipe))
+
+
 class TrainingDisplay(TrainingObserver):
     """Shows progress, time left, speed, reward and episode length, updated every iteration."""
 
     def __init__(self, title: str, console: Console | None = None) -> None:
-        self._console = console or Console()
+        self._console = console or _LastingConsole()
         self._title = title
         self._live: Live | None = None
         self._progress = Progress(
@@ -90,7 +100,8 @@ class TrainingDisplay(TrainingObserver):
     def on_stop_requested(self, signal_name: str) -> None:
         """Tell that a signal arrived and what happens now."""
         if signal_name == "SIGHUP":
-            _let_go_of_the_terminal()
+            # A terminal that was closed is none to `isatty`, but still a character device.
+            _let_go_of(lambda file: stat.S_ISCHR(file.st_mode))
         self._console.print(
             f"{signal_name}: finishing this iteration, then saving. Once more to stop at once.",
             highlight=False,
@@ -116,17 +127,15 @@ class TrainingDisplay(TrainingObserver):
         return Panel(Group(self._progress, table), title=self._title, title_align="left")
 
 
-def _let_go_of_the_terminal() -> None:
-    """Send standard output and error nowhere if they go to a terminal, which was closed.
+def _let_go_of(is_gone: Callable[[os.stat_result], bool]) -> None:
+    """Send standard output and error nowhere where `is_gone` holds for their file.
 
     Otherwise the next line would raise, before there is a checkpoint.
     """
     # In a signal handler nothing may be raised, such as for a descriptor that is closed.
     with open(os.devnull, "wb") as nowhere, contextlib.suppress(OSError):
-        for number in (1, 2):
-            # A terminal that was closed is none to `isatty`, but still a character device.
-            if stat.S_ISCHR(os.fstat(number).st_mode):
-                os.dup2(nowhere.fileno(), number)
+        for number in [number for number in (1, 2) if is_gone(os.fstat(number))]:
+            os.dup2(nowhere.fileno(), number)
 
 
 def _cells(stats: IterationStats) -> list[tuple[str, str]]:

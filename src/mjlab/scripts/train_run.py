@@ -35,6 +35,7 @@ from mjlab.scripts.run_folder import (
 from mjlab.scripts.task_options import options_of, prepare_env_cfg, with_task_options
 from mjlab.scripts.train_checks import check_flags
 from mjlab.scripts.training_device import training_device
+from mjlab.sim.warning_log import mujoco_warnings
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls, task_source
 from mjlab.utils.processes import (
     ProcessRank,
@@ -201,9 +202,11 @@ def _train(
             print(f"Run:     {folder.path}", flush=True)
             if rank.is_first:
                 _write_params(task, cfg, folder.path, checkpoint)
-            _learn(task, cfg, runner, folder)
-            if rank.is_first:
-                _tell_of_divergence(env.unwrapped)
+            try:
+                _learn(task, cfg, runner, folder)
+            finally:
+                if rank.is_first:
+                    _tell_of_divergence(env.unwrapped)
         finally:
             env.close()
     if rank.is_first:
@@ -325,7 +328,7 @@ def _build_runner(
     seed_rng(cfg.agent.seed)
     further = options_of(task, cfg).runner_kwargs()
     runner = runner_cls(env, asdict(cfg.agent), str(run_dir), device, **further)
-    if (source := task_source(task)) is not None:
+    if (source := task_source(task)) is not None and hasattr(runner, "add_git_repo_to_log"):
         runner.add_git_repo_to_log(source)
     return runner
 
@@ -380,6 +383,8 @@ def _tell_of_divergence(env: ManagerBasedRlEnv) -> None:
             f"Diverged: the physics of {environments} of {env.num_envs} environments, in {episodes} "
             "episodes (Simulation/nan_resets)"
         )
+    for kind, count in mujoco_warnings().items():
+        print(f"MuJoCo warned {count:,} times: {kind}")
 
 
 def _leave_results(task: str, cfg: TrainConfig, run_dir: Path, device: str) -> None:

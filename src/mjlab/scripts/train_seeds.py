@@ -22,7 +22,7 @@ from mjlab.scripts.run_folder import read_run_info, run_folders
 from mjlab.utils.processes import PARENT_VARIABLE
 
 # Signals that end this process, and what the training process gets for each: it handles the first
-# two by saving, while SIGHUP (the terminal was closed) would lose what was learned.
+# two by saving.
 _FORWARDED: dict[int, signal.Signals] = {
     signal.SIGINT: signal.SIGINT,
     signal.SIGTERM: signal.SIGTERM,

@@ -328,6 +328,10 @@ class Engine(ABC):
                 bad |= ~(values.abs().amax(dim=1) <= mujoco.mjMAXVAL)
         return bad
 
+    def bad_dof(self, env_idx: int) -> int | None:
+        """Return the degree of freedom at which MuJoCo found the state bad; None if it is not known."""
+        return None
+
     @abstractmethod
     def raycast(self, query: RayQuery) -> RayHits:
         """Cast rays at the current state.

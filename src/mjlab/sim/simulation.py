@@ -411,6 +411,10 @@ class Simulation:
         """
         return self._engine.bad_states()
 
+    def bad_dof(self, env_idx: int) -> int | None:
+        """Return the degree of freedom at which MuJoCo found the state bad; None if it is not known."""
+        return self._engine.bad_dof(env_idx)
+
     def reset(self, env_ids: EnvIds = None) -> None:
         """Put environments into the model's initial state: time 0, `qpos0`, the rest zero.
 

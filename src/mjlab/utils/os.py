@@ -10,8 +10,10 @@ import logging
 import os
 import re
 import secrets
+import socket
 import stat
 import tempfile
+import time
 from collections.abc import Generator, Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -29,7 +31,9 @@ logger = logging.getLogger(__name__)
 
 _WANDB_CACHE = "wandb_checkpoints"
 # See `temporary_path`. Those of other programs, and of earlier versions, carry no lock.
-_TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.tmp")
+_TEMPORARY = re.compile(r"\.(.+)\.\d+-[0-9a-f]{8}\.tmp")
+# Age from which those of other machines, whose locks may not be seen here, are removed.
+_SECONDS_TO_KEEP = 86400.0
 _WANDB_CHECKPOINT = re.compile(r"model_(\d+)\.pt")
 
 
@@ -240,7 +244,8 @@ def replacing(path: Path, *, flush: bool = False) -> Generator[IO[bytes]]:
 
 def temporary_path(path: Path) -> Path:
     """Return a new name beside `path`, for a file of this process that will take its place."""
-    return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    owner = f"{socket.gethostname()}.{os.getpid()}"
+    return path.with_name(f".{path.name}.{owner}-{secrets.token_hex(4)}.tmp")
 
 
 def create_locked(path: Path) -> IO[bytes]:
@@ -284,10 +289,18 @@ def remove_abandoned(path: Path) -> bool:
 
 
 def remove_temporary_files(folder: Path) -> None:
-    """Remove the files in `folder` that a process was writing (`replacing`) when it was killed."""
+    """Remove the files in `folder` that a process was writing (`replacing`) when it was killed.
+
+    Those of other machines only after a day.
+    """
     for path in folder.glob(".*.tmp"):
-        if _TEMPORARY.fullmatch(path.name):
-            remove_abandoned(path)
+        match = _TEMPORARY.fullmatch(path.name)
+        if match is None:
+            continue
+        with contextlib.suppress(OSError):
+            is_old = time.time() - path.stat().st_mtime > _SECONDS_TO_KEEP
+            if is_old or match.group(1).endswith(f".{socket.gethostname()}"):
+                remove_abandoned(path)
 
 
 def own_folder(folder: Path) -> Path:

@@ -91,16 +91,30 @@ def end_with_launcher() -> None:
     """
     # Not for processes that this one starts.
     given = os.environ.pop(PARENT_VARIABLE, None)
-    if given is None and "TORCHELASTIC_RUN_ID" not in os.environ:
+    # Elsewhere the number of a parent does not change when it ends.
+    if os.name != "posix" or (given is None and "TORCHELASTIC_RUN_ID" not in os.environ):
         return
-    parent = os.getppid() if given is None else int(given)
+    parent = os.getppid()
+    # A wrapper may stand between.
+    launcher = parent if given is None else int(given)
 
     def watch() -> None:
-        while os.getppid() == parent:
+        while os.getppid() == parent and _is_running(launcher):
             time.sleep(_SECONDS_BETWEEN_LOOKS)
         os.kill(os.getpid(), signal.SIGTERM)
 
     threading.Thread(target=watch, name="end-with-launcher", daemon=True).start()
+
+
+def _is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        # It is another user's.
+        pass
+    return True
 
 
 def cores_per_process() -> int:

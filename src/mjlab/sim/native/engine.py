@@ -90,6 +90,8 @@ _WITHOUT_CONSTRAINTS = int(
     mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
 )
 
+# Columns of `Batch.warning`: the last index that MuJoCo warned of, and the number of warnings.
+_INDEX, _COUNT = 0, 1
 _BAD_STATES = [
     int(mujoco.mjtWarning.mjWARN_BADQPOS),
     int(mujoco.mjtWarning.mjWARN_BADQVEL),
@@ -335,8 +337,15 @@ class NativeEngine(Engine):
     def bad_states(self) -> torch.Tensor:
         # Counted since the reset. MuJoCo looks at each substep, and at accelerations, which are not
         # copied unless they are read.
-        warned = self._batch.warning[:, _BAD_STATES, 0].any(axis=1)
+        warned = self._batch.warning[:, _BAD_STATES, _COUNT].any(axis=1)
         return super().bad_states() | torch.from_numpy(warned)
+
+    def bad_dof(self, env_idx: int) -> int | None:
+        warnings = self._batch.warning[env_idx]
+        for kind in (mujoco.mjtWarning.mjWARN_BADQACC, mujoco.mjtWarning.mjWARN_BADQVEL):
+            if warnings[int(kind), _COUNT]:
+                return int(warnings[int(kind), _INDEX])
+        return None
 
     def look_ahead(self, env_ids: torch.Tensor) -> Any:
         fields = {name: field.values[env_ids] for name, field in self._outputs.items()}

@@ -368,6 +368,10 @@ class WarpEngine(Engine):
         self._overflow.tick()
         return recorded
 
+    def bad_dof(self, env_idx: int) -> int | None:
+        bad = ~(self.data_field("qacc")[env_idx].abs() <= mujoco.mjMAXVAL)
+        return int(bad.to(torch.int32).argmax()) if bool(bad.any()) else None
+
     def _substep(self) -> None:
         self._refresh_velocities()
         mjwarp.step(self.wp_model, self.wp_data)
