@@ -69,7 +69,7 @@ def test_too_little_memory_is_one_message(run, tmp_path, monkeypatch, error):
     monkeypatch.setattr("mjlab.scripts.train_run._build_env", build)
     outcome = run("train", TASK, *SMALL, "--log-root", str(tmp_path))
     assert outcome.status == 1
-    assert "memory" in outcome.message
+    assert "Memory" in outcome.message
     assert "Traceback" not in outcome.err
 
 
