@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import errno
 import os
 import pickle
@@ -139,15 +140,18 @@ def test_weights_and_rates_that_are_not_finite_are_refused(make_runner, tmp_path
     assert all(torch.equal(before[key], after[key]) for key in before)
 
 
-def test_an_optimizer_without_the_moments_of_a_parameter_is_refused(make_runner, tmp_path: Path):
+def test_an_optimizer_without_moments_or_with_odd_switches_is_refused(make_runner, tmp_path: Path):
     runner = make_runner()
     runner.learn(1)
     runner.save(str(tmp_path / "model_0.pt"))
     broken = load_checkpoint(tmp_path / "model_0.pt")
-    broken["optimizer_state_dict"]["state"][1] = {}
-    save_checkpoint(broken, tmp_path / "model_0.pt")
-    with pytest.raises(CheckpointError, match="optimizer state"):
-        runner.load(str(tmp_path / "model_0.pt"))
+    for place, name, value in (("state", 1, {}), ("param_groups", 0, {"capturable": 0.5})):
+        changed = copy.deepcopy(broken)
+        entry = changed["optimizer_state_dict"][place]
+        entry[name] = {**entry[name], **value} if value else {}
+        save_checkpoint(changed, tmp_path / "model_0.pt")
+        with pytest.raises(CheckpointError, match="optimizer state"):
+            runner.load(str(tmp_path / "model_0.pt"))
 
 
 @pytest.mark.parametrize("garbage", [7, {}, None, {"a": torch.zeros(2)}])

@@ -278,6 +278,15 @@ def test_an_error_leaves_what_was_learned_before_it(
     resumed.learn(4)
 
 
+def test_losses_that_are_not_finite_are_told_once(make_runner, monkeypatch, caplog):
+    runner = make_runner()
+    update = runner.alg.update
+    monkeypatch.setattr(runner.alg, "update", lambda: {**update(), "mine": float("inf")})
+    runner.learn(3)
+    (told,) = [r.getMessage() for r in caplog.records if "Losses" in r.getMessage()]
+    assert "iteration 1: mine" in told
+
+
 def test_weights_that_are_nan_are_not_saved_after_the_error_that_they_cause(
     make_runner, tmp_path: Path, monkeypatch
 ):

@@ -95,3 +95,15 @@ def test_a_profile_for_another_learner_is_told(run, tmp_path, monkeypatch, learn
     outcome = run("train", "Test-Profiled", *small, *flags)
     assert outcome.status == 0, outcome.err
     assert ("settings for the learner 'ppo'" in outcome.err) == is_told
+
+
+def test_a_message_of_a_damaged_file_is_cut_in_the_middle(run, monkeypatch):
+    def build(*args, **kwargs):
+        raise ValueError("begins " + "x" * 100_000 + " ends")
+
+    monkeypatch.setattr("mjlab.scripts.train_run.launch_training", build)
+    outcome = run("train", TASK, *SMALL)
+    assert outcome.status == 1
+    assert len(outcome.err) < 10_000
+    assert "begins" in outcome.message
+    assert "ends" in outcome.message

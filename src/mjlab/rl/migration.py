@@ -204,6 +204,10 @@ def _optimizer_fits(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) 
     for group, own in zip(groups, optimizer.param_groups, strict=True):
         if len(group["params"]) != len(own["params"]) or not isinstance(group["lr"], float):
             return False
+        # Switches of torch's optimizers; another release may have others.
+        switches = [name for name, value in own.items() if isinstance(value, bool)]
+        if not all(isinstance(group.get(name, False), bool) for name in switches):
+            return False
         for number, parameter in zip(group["params"], own["params"], strict=True):
             state = saved["state"].get(number)
             if state is not None and not state:

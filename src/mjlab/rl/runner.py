@@ -6,6 +6,7 @@ import contextlib
 import copy
 import io
 import logging
+import math
 import os
 import time
 from collections.abc import Generator, Mapping
@@ -133,6 +134,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self.last_evaluation: EvaluationResult | None = None
         self._observations: TensorDict | None = None
         self._state_to_resume: dict[str, Any] | None = None
+        self._has_told_losses = False
         # Descriptor of the run folder, while training.
         self._run_folder: int | None = None
         # What the algorithm saves after the last iteration that was finished since `learn` began.
@@ -346,6 +348,13 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             rnd_weight=rnd.weight if (rnd := getattr(self.alg, "rnd", None)) else None,
         )
         self._tell("on_iteration", stats)
+        broken = [name for name, value in losses.items() if not math.isfinite(value)]
+        if broken and not self._has_told_losses:
+            self._has_told_losses = True
+            logger.warning(
+                "Losses that are NaN or infinite in iteration %d: %s. Rewards or observations may be too "
+                "large. It is not logged again.", iteration + 1, ", ".join(broken),
+            )  # fmt: skip
         return stats
 
     def _reason_to_stop(self, stop: StopRequest, stats: IterationStats) -> str:

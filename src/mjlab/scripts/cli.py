@@ -40,6 +40,7 @@ _OUT_OF_MEMORY = (
     "Could not allocate memory",
     "out of memory. Tried to allocate",
 )
+_LONGEST_MESSAGE = 8000
 
 
 class UserError(Exception):
@@ -152,12 +153,18 @@ def _raised_on_purpose(error: BaseException) -> bool:
 def _text(error: BaseException) -> str:
     # A KeyError shows its text in quotes.
     text = str(error.args[0] if isinstance(error, KeyError) and error.args else error).strip()
-    return text if text else type(error).__name__
+    return _cut(text) if text else type(error).__name__
+
+
+def _cut(text: str) -> str:
+    """Return `text`; if it is of a damaged file, say, only its beginning and its end."""
+    half = _LONGEST_MESSAGE // 2
+    return text if len(text) <= _LONGEST_MESSAGE else f"{text[:half]} [...] {text[-half:]}"
 
 
 def tell(message: str) -> None:
     """Print a notice for people. Standard output is left to what the command is asked for."""
-    print(message, file=sys.stderr, flush=True)
+    print(_cut(message), file=sys.stderr, flush=True)
 
 
 def first_and_flags(
