@@ -51,7 +51,7 @@ class Trial:
     folder: Path
     """Folder of its own, which is the working folder, and is removed afterwards."""
     what: str = ""
-    """What is tried, for the line of a failure; see `trying`."""
+    """Description of the trial, for the line of a failure; see `trying`."""
     notes: list[str] = field(default_factory=list)
     """Observations that are no failures."""
     rng: random.Random = field(init=False)
@@ -67,13 +67,13 @@ class Trial:
 
 @dataclass(frozen=True)
 class Verdict:
-    """How a trial ended."""
+    """Outcome of a trial."""
 
     family: str
     number: int
     what: str = ""
     broken: str | None = None
-    """How the contract was broken; None if it was held."""
+    """Violation of the contract; None if it held."""
     notes: tuple[str, ...] = ()
 
     def line(self, seed: int) -> str:

@@ -62,13 +62,14 @@ class DivergenceLog:
             velocity = self._velocities[env]
         speeds = velocity.abs().tolist()
         dof, motion = fastest_dof(model, speeds)
-        if motion <= 1.0 and (found := self._sim.bad_dof(env)) is not None:
+        if motion > 1.0:
+            return describe_dof(model, dof, speeds[dof]), cure_of(model, dof)
+        # Within the step, or something wrote such a state.
+        found = self._sim.bad_dof(env)
+        if found is not None:
             name = model.joint(int(model.dof_jntid[found])).name
             return f"MuJoCo found the state of joint {name!r} bad", cure_of(model, found)
-        if motion <= 1.0:
-            # Within the step, or something wrote such a state.
-            return "its state is not finite", (
-                "Use a smaller sim.mujoco.timestep (now "
-                f"{float(model.opt.timestep):g} s) unless a term or an event wrote this state."
-            )
-        return describe_dof(model, dof, speeds[dof]), cure_of(model, dof)
+        return "its state is not finite", (
+            f"Use a smaller sim.mujoco.timestep (now {float(model.opt.timestep):g} s) unless a term or "
+            "an event wrote this state."
+        )

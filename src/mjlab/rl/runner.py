@@ -615,7 +615,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         folder = self.logger.log_dir
         if self._run_folder is None or folder is None:
             return
-        # Whoever writes next, such as TensorBoard, makes another folder of that name.
+        # The next writer, such as TensorBoard, creates another folder of that name.
         with contextlib.suppress(OSError):
             if os.path.samestat(os.fstat(self._run_folder), os.stat(folder)):
                 return

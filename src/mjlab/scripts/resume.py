@@ -52,7 +52,7 @@ def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
             with contextlib.suppress(ValueError):
                 return get_checkpoint_path(experiment, re.escape(run.name), agent.load_checkpoint)
     own = "|".join(re.escape(run.name) for run in matching if run.name not in others)
-    # Raises an error that says what there is.
+    # Raises an error that lists the runs and checkpoints.
     return get_checkpoint_path(experiment, own or agent.load_run, agent.load_checkpoint)
 
 

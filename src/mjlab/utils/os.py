@@ -176,7 +176,6 @@ def get_wandb_checkpoint_path(
     A cached file is used as it is. Raises `ValueError`, listing the checkpoints there are, if the
     run does not have the one asked for, and `ConnectionError` if Weights & Biases does not give it.
     """
-
     cache = Path(log_path) / _WANDB_CACHE / Path(run_path).name
     if checkpoint_name is not None and _WANDB_CHECKPOINT.fullmatch(checkpoint_name):
         cached = cache / checkpoint_name
