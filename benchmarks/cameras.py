@@ -31,8 +31,7 @@ from mjlab.envs import ManagerBasedRlEnv
 from mjlab.sim import Simulation
 from mjlab.sim.engine import CameraView
 from mjlab.tasks.registry import load_env_cfg
-from mjlab.viewer.errors import RenderingUnavailableError
-from mjlab.viewer.gl_context import open_renderer
+from mjlab.viewer.offscreen_renderer import RenderingUnavailableError, open_renderer
 
 TASK, SENSOR, SIZE = "Mjlab-Lift-Cube-Yam-Rgb", "camera_d405", 32
 # Images a second of two cores that are to be reached.

@@ -22,8 +22,8 @@ from gymnasium.vector import AutoresetMode
 
 from mjlab.rl import MjlabOnPolicyRunner
 from mjlab.rl.config import RslRlOffPolicyRunnerCfg, squashed_gaussian
-from mjlab.rl.progress import IterationStats, TrainingObserver
 from mjlab.rl.rsl import TensorDict, VecEnv
+from mjlab.rl.run_logger import IterationStats, TrainingObserver
 
 
 class GymnasiumVecEnv(VecEnv):

@@ -14,7 +14,7 @@ from report import Row, show
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
-from mjlab.rl.progress import IterationStats, TrainingObserver
+from mjlab.rl.run_logger import IterationStats, TrainingObserver
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.torch import prepare_torch
 

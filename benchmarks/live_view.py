@@ -30,7 +30,7 @@ from report import Row
 from websockets.sync.client import connect
 
 from mjlab.rl.config import EvaluationCfg
-from mjlab.rl.progress import IterationStats, TrainingObserver
+from mjlab.rl.run_logger import IterationStats, TrainingObserver
 from mjlab.scripts import train_run
 from mjlab.scripts.live import LiveView
 from mjlab.tasks.registry import load_runner_cls

@@ -21,8 +21,7 @@ from mjlab.sim import Simulation, SimulationCfg
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.terrains import SubTerrainCfg, TerrainEntityCfg, TerrainGenerator, TerrainGeneratorCfg
 from mjlab.terrains.config import ALL_TERRAIN_PRESETS
-from mjlab.viewer.gl_context import open_renderer
-from mjlab.viewer.offscreen_renderer import OffscreenRenderer
+from mjlab.viewer.offscreen_renderer import OffscreenRenderer, open_renderer
 from mjlab.viewer.viewer_config import ViewerConfig
 from mjlab.viewer.viser.camera_viewer import depth_colors, segmentation_colors
 

@@ -15,7 +15,7 @@ from stable_baselines3 import PPO
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl import RslRlVecEnvWrapper
-from mjlab.rl.evaluate import evaluate_policy
+from mjlab.rl.evaluation import evaluate_policy
 from mjlab.rl.sb3 import Sb3VecEnv
 from mjlab.tasks.registry import load_env_cfg
 

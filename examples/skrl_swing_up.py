@@ -22,7 +22,7 @@ from torch import nn
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl import RslRlVecEnvWrapper
-from mjlab.rl.evaluate import evaluate_policy
+from mjlab.rl.evaluation import evaluate_policy
 from mjlab.rl.skrl import SkrlEnv, with_final_observations
 from mjlab.tasks.registry import load_env_cfg
 

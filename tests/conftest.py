@@ -42,8 +42,7 @@ def gl() -> None:
     """Skip where this machine cannot render offscreen."""
     import mujoco
 
-    from mjlab.viewer.errors import RenderingUnavailableError
-    from mjlab.viewer.gl_context import open_renderer
+    from mjlab.viewer.offscreen_renderer import RenderingUnavailableError, open_renderer
 
     try:
         open_renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()

@@ -40,7 +40,7 @@ DEVIATIONS = {
 # Flags of 1.6 that are not there: the reason is said once for each.
 MISSING_FLAGS = {
     "mjlab.scripts.train.TrainConfig": {
-        # Of motion tracking, which brings it itself: see `mjlab.tasks.options`.
+        # Of motion tracking, which brings it itself: see `mjlab.tasks.registry`.
         "registry_name",
     },
     "mjlab.scripts.play.PlayConfig": {

@@ -26,8 +26,7 @@ from mjlab.actuator import (
     TransmissionType,
     XmlActuatorCfg,
 )
-from mjlab.actuator.actuator import delay_command
-from mjlab.actuator.direct import DirectActuator
+from mjlab.actuator.actuator import DirectActuator, delay_command
 from mjlab.utils.buffers import DelayBuffer
 from mjlab.utils.state import capture_state, restore_state
 

@@ -9,9 +9,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mjlab.actuator.actuator import constant_within_step
 from mjlab.managers import ActionManager, ActionTerm, ActionTermCfg
-from mjlab.managers.finite_action import DeferredCheck
-from mjlab.utils.substep import constant_within_step
+from mjlab.managers.action_manager import DeferredCheck
 
 
 class Keep(ActionTerm):

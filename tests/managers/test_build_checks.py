@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mjlab.managers import RewardManager, RewardTermCfg, SceneEntityCfg
-from mjlab.managers.build_checks import checked_when_built
+from mjlab.managers.term_checks import checked_when_built
 
 
 @pytest.fixture

@@ -19,9 +19,9 @@ from mjlab.rl.checkpoint import (
     RunFolderError,
     ensure_writable_folder,
     load_checkpoint,
+    migrate,
     save_checkpoint,
 )
-from mjlab.rl.migration import migrate
 from mjlab.utils.random import preserved_rng, rng_state, set_rng_state
 
 

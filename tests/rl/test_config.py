@@ -17,7 +17,7 @@ from mjlab.rl import (
     RslRlOnPolicyRunnerCfg,
     RslRlPpoAlgorithmCfg,
 )
-from mjlab.rl.threads import torch_threads, using_torch_threads
+from mjlab.utils.torch import torch_threads, using_torch_threads
 
 
 def test_defaults_are_those_of_the_interface():

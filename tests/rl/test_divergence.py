@@ -19,7 +19,7 @@ from mjlab.managers import (
 )
 from mjlab.rl import MjlabOnPolicyRunner, RslRlOnPolicyRunnerCfg, RslRlVecEnvWrapper
 from mjlab.rl.divergence import DivergedError
-from mjlab.rl.progress import TrainingObserver
+from mjlab.rl.run_logger import TrainingObserver
 from mjlab.scene import SceneCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
 

@@ -11,11 +11,12 @@ import torch
 from rl_fake_env import FakeEnv, FakeEnvCfg, FakeSceneCfg
 
 from mjlab.rl import RslRlVecEnvWrapper
-from mjlab.rl.evaluate import evaluate_policy, make_evaluation_env
-from mjlab.rl.evaluation_result import (
+from mjlab.rl.evaluation import (
     Episodes,
     EvaluationResult,
     episodes_to_show,
+    evaluate_policy,
+    make_evaluation_env,
     mean_and_interval,
     summarize,
     wilson_interval,

@@ -13,7 +13,7 @@ from mjlab.envs import ManagerBasedRlEnv
 from mjlab.envs.mdp import reward_curriculum
 from mjlab.managers import CurriculumTermCfg
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
-from mjlab.rl.evaluate import evaluate_policy
+from mjlab.rl.evaluation import evaluate_policy
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 
 TASK = "Mjlab-Cartpole-Swingup"

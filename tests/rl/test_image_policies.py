@@ -19,9 +19,9 @@ from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import ObservationGroupCfg, ObservationTermCfg
 from mjlab.rl import MjlabOnPolicyRunner, RslRlModelCfg, RslRlVecEnvWrapper
 from mjlab.rl.config import RslRlOnPolicyRunnerCfg, RslRlPpoAlgorithmCfg
-from mjlab.rl.evaluate import evaluate_policy
-from mjlab.rl.network_checks import check_networks
-from mjlab.rl.onnx_export import export_to_onnx
+from mjlab.rl.evaluation import evaluate_policy
+from mjlab.rl.exporter_utils import export_to_onnx
+from mjlab.rl.networks import check_networks
 from mjlab.rl.onnx_policy import OnnxPolicy, OnnxPolicyError, load_onnx_policy
 from mjlab.rl.rsl import CNNModel, TensorDict
 from mjlab.rl.spatial_softmax import SpatialSoftmaxCNNModel

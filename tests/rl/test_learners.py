@@ -16,7 +16,7 @@ from mjlab.rl.config import (
     RslRlOnPolicyRunnerCfg,
 )
 from mjlab.rl.learners import acting_cfg, learner_of, with_learner
-from mjlab.rl.network_checks import check_networks
+from mjlab.rl.networks import check_networks
 from mjlab.rl.rsl import TensorDict
 
 MIRROR = "mjlab.tasks.velocity.symmetry:mirror_left_right"

@@ -12,8 +12,12 @@ import pytest
 import torch
 from onnx import TensorProto, helper
 
-from mjlab.rl.exporter_utils import DIGEST_KEY, attach_metadata_to_onnx, initializers_digest
-from mjlab.rl.onnx_export import export_to_onnx
+from mjlab.rl.exporter_utils import (
+    DIGEST_KEY,
+    attach_metadata_to_onnx,
+    export_to_onnx,
+    initializers_digest,
+)
 from mjlab.rl.onnx_policy import OnnxPolicy, OnnxPolicyError, _alike, load_onnx_policy
 from mjlab.rl.rsl import RNNModel, TensorDict
 

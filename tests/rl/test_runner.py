@@ -14,7 +14,7 @@ import torch
 
 from mjlab.rl.checkpoint import CheckpointError, RunFolderError, load_checkpoint
 from mjlab.rl.config import EvaluationCfg
-from mjlab.rl.progress import IterationStats, TrainingObserver
+from mjlab.rl.run_logger import IterationStats, TrainingObserver
 
 
 class Recorder(TrainingObserver):
@@ -556,7 +556,7 @@ def test_weights_and_biases_gets_figures_and_files_only_on_request(
 @pytest.mark.parametrize("base", ["MjlabOnPolicyRunner", "ExportingOnPolicyRunner"])
 def test_a_subclass_decides_where_policies_are_exported(make_runner, tmp_path: Path, base):
     from mjlab import rl
-    from mjlab.rl.exporting_runner import ExportingOnPolicyRunner
+    from mjlab.rl.runner import ExportingOnPolicyRunner
 
     class Own(
         {"ExportingOnPolicyRunner": ExportingOnPolicyRunner}.get(base, rl.MjlabOnPolicyRunner)

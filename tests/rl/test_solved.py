@@ -14,10 +14,9 @@ from rl_fake_env import FakeEnv, FakeEnvCfg, FakeSceneCfg, runner_cfg
 
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
 from mjlab.rl.config import EvaluationCfg
-from mjlab.rl.evaluation_result import episodes_to_show
+from mjlab.rl.evaluation import SolvedCheck, episodes_to_show
 from mjlab.rl.plot import read_scalars
-from mjlab.rl.progress import TrainingObserver
-from mjlab.rl.solved import SolvedCheck
+from mjlab.rl.run_logger import TrainingObserver
 
 BOUND = 0.05
 EPISODES = 200

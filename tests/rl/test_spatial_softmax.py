@@ -7,7 +7,7 @@ import onnxruntime
 import pytest
 import torch
 
-from mjlab.rl.onnx_export import export_to_onnx
+from mjlab.rl.exporter_utils import export_to_onnx
 from mjlab.rl.rsl import TensorDict
 from mjlab.rl.spatial_softmax import SpatialSoftmax, SpatialSoftmaxCNN, SpatialSoftmaxCNNModel
 

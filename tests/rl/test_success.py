@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from mjlab.rl import EvaluationCfg
-from mjlab.rl.success import required_return, success_definition
-from mjlab.tasks.manipulation.success import placed_at_goal
+from mjlab.rl.evaluation import required_return, success_definition
+from mjlab.tasks.manipulation.config.yam.rl_cfg import placed_at_goal
 
 
 def upright(env: Any) -> torch.Tensor:

@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from mjlab.rl.progress import IterationStats
+from mjlab.rl.run_logger import IterationStats
 from mjlab.scripts import train_run
 from mjlab.scripts.run_folder import checkpoints_in, read_run_info
 

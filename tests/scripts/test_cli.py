@@ -14,7 +14,7 @@ from mjlab.scripts import cli
 from mjlab.scripts.cli import UserError, parse_flags, resolve_device, run_command, task_and_flags
 from mjlab.sim.engine import EngineUnavailableError
 from mjlab.tasks.registry import UnknownTaskError
-from mjlab.viewer.errors import RenderingUnavailableError
+from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
 
 USAGE = "usage: try TASK [flags]"
 TASK = "Mjlab-Cartpole-Swingup"

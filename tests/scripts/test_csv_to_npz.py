@@ -17,14 +17,15 @@ from mjlab.asset_zoo.robots import get_g1_robot_cfg
 from mjlab.scripts.cli import UserError
 from mjlab.scripts.csv_to_npz_run import CsvToNpzConfig, convert
 from mjlab.scripts.motion_page import MotionPage
-from mjlab.tasks.tracking.motion_csv import read_csv, write_csv
 from mjlab.tasks.tracking.motion_file import MotionFileError, read_motion
-from mjlab.tasks.tracking.motion_kinematics import (
+from mjlab.tasks.tracking.motion_recording import (
     Recording,
     angular_velocities,
+    read_csv,
     recording_of,
     resampled,
     slerp,
+    write_csv,
 )
 
 JOINTS = get_g1_robot_cfg().build().joint_names
@@ -220,7 +221,7 @@ def test_a_video_is_written_beside_the_output(csv, tmp_path, monkeypatch):
         render=lambda: frames.append(1) or np.zeros((48, 64, 3), np.uint8),
         close=lambda: None,
     )
-    monkeypatch.setattr("mjlab.viewer.gl_context.open_renderer", lambda *args: renderer)
+    monkeypatch.setattr("mjlab.viewer.offscreen_renderer.open_renderer", lambda *args: renderer)
     converted(csv, tmp_path, line_range=(1, 13), render=True)
     assert len(frames) == 20
     assert (tmp_path / "out" / "dance.mp4").stat().st_size > 500

@@ -8,8 +8,8 @@ import io
 import pytest
 from rich.console import Console
 
-from mjlab.rl.evaluation_result import EvaluationResult
-from mjlab.rl.progress import IterationStats
+from mjlab.rl.evaluation import EvaluationResult
+from mjlab.rl.run_logger import IterationStats
 from mjlab.scripts import display
 from mjlab.scripts.display import TrainingDisplay, duration
 

@@ -15,7 +15,7 @@ import torch
 from commands import SMALL, TASK
 
 from mjlab.rl.checkpoint import load_checkpoint
-from mjlab.rl.progress import IterationStats
+from mjlab.rl.run_logger import IterationStats
 from mjlab.scripts import live
 from mjlab.scripts.live import Exchange, LiveJob, LiveView
 from mjlab.scripts.live_view import NewestWeights

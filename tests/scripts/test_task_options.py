@@ -12,7 +12,7 @@ from mjlab.scripts.policy import env_cfg_of, parse_policy_flags
 from mjlab.scripts.task_options import options_of, prepare_env_cfg, with_task_options
 from mjlab.scripts.train_run import TrainConfig, parse_train_flags
 from mjlab.tasks import registry
-from mjlab.tasks.options import PolicyOrigin, TaskOptions
+from mjlab.tasks.registry import PolicyOrigin, TaskOptions
 
 TASK = "Test-With-Options"
 PLAIN = "Mjlab-Cartpole-Balance"

@@ -182,7 +182,7 @@ def test_what_was_randomized_is_seen():
 
 
 def test_depths_are_those_of_the_renderer_of_mujoco(gl):
-    from mjlab.viewer.gl_context import open_renderer
+    from mjlab.viewer.offscreen_renderer import open_renderer
 
     names = ("front", "top")
     sensors = [

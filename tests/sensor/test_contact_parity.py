@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mjlab.sensor import ContactData
-from mjlab.sensor._contact_layout import FIELD_SIZES
+from mjlab.sensor.contact_sensor import FIELD_SIZES
 
 from .contact_scenes import LOPSIDED, TERRAIN, body, build, geom, sense
 

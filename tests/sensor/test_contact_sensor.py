@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mjlab.sensor import BuiltinSensor, ContactData
-from mjlab.sensor._contact_layout import FIELD_SIZES
+from mjlab.sensor.contact_sensor import FIELD_SIZES
 
 from .contact_scenes import (
     BOX,

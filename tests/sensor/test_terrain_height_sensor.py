@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mjlab.sensor import ObjRef, RingPatternCfg, TerrainHeightSensorCfg
-from mjlab.sensor._one_sided_ground import OneSidedGround
+from mjlab.sensor.terrain_height_sensor import OneSidedGround
 
 from .ray_scenes import BASE, ROBOT, field_of, floor, scene_with, sense
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mjlab.terrains._flat_patches import find_flat_patches_from_heightfield as find
 from mjlab.terrains.terrain_generator import FlatPatchSamplingCfg
 from mjlab.terrains.utils import find_flat_patches_from_heightfield
+from mjlab.terrains.utils import find_flat_patches_from_heightfield as find
 
 from .heightfields import Built, build, obstacles, perlin, rough, slope
 

@@ -368,6 +368,8 @@ def test_what_cannot_be_built_is_refused_by_name(cfg, message):
 
 
 def test_fields_beyond_the_memory_are_refused_with_an_estimate(monkeypatch):
-    monkeypatch.setattr("mjlab.terrains._heightfield.available_memory", lambda device: 70_000)
+    monkeypatch.setattr(
+        "mjlab.terrains.heightfield_terrains.available_memory", lambda device: 70_000
+    )
     with pytest.raises(ValueError, match=r"expected at most 5,000 pixels.*got 6,400"):
         build(rough())

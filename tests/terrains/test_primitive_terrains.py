@@ -19,7 +19,7 @@ from mjlab.terrains import (
     BoxSteppingStonesTerrainCfg,
     BoxTiltedGridTerrainCfg,
 )
-from mjlab.terrains._merge import merge_equal_cells
+from mjlab.terrains.boxes import merge_equal_cells
 from mjlab.terrains.config import ALL_TERRAIN_PRESETS
 
 from .ground import SIZE, Ground, ground

@@ -19,7 +19,7 @@ from mjlab.terrains import (
     TerrainGeneratorCfg,
 )
 from mjlab.terrains.config import flat, hf_pyramid_slope, pyramid_stairs
-from mjlab.terrains.origins import assign_columns, grid_origins, split_by_proportion
+from mjlab.terrains.terrain_entity import assign_columns, grid_origins, split_by_proportion
 from mjlab.utils.state import capture_state, restore_state, shape_differences
 
 

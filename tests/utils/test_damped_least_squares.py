@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mjlab.utils.damped_least_squares import damped_least_squares
+from mjlab.envs.mdp.actions.differential_ik import damped_least_squares
 
 
 def problem(seed: int, rows: int, unknowns: int) -> tuple[torch.Tensor, ...]:

@@ -12,7 +12,7 @@ import pytest
 DRAW = """
 import mujoco
 from mjlab.viewer import RenderingUnavailableError
-from mjlab.viewer.gl_context import open_renderer
+from mjlab.viewer.offscreen_renderer import open_renderer
 try:
     open_renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8)
 except RenderingUnavailableError as error:

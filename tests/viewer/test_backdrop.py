@@ -6,9 +6,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjlab.viewer.backdrop import has_sky, move_sun, paint_sky, prepare_sun
-from mjlab.viewer.errors import RenderingUnavailableError
-from mjlab.viewer.gl_context import open_renderer
+from mjlab.viewer.offscreen_renderer import (
+    RenderingUnavailableError,
+    has_sky,
+    move_sun,
+    open_renderer,
+    paint_sky,
+    prepare_sun,
+)
 
 XML = """
 <mujoco>

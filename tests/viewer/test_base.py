@@ -11,8 +11,7 @@ import pytest
 import torch
 from viewer_fakes import FakeEnv, push
 
-from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction
-from mjlab.viewer.protocols import forget
+from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction, forget
 
 
 class ListViewer(BaseViewer):

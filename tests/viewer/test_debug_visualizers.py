@@ -14,7 +14,7 @@ from viewer_fakes import FakeEnv
 
 from mjlab.viewer.debug_visualizer import DebugVisualizer, NullDebugVisualizer
 from mjlab.viewer.native import MujocoNativeDebugVisualizer
-from mjlab.viewer.viser.debug_items import ViserDebugVisualizer, _direction
+from mjlab.viewer.viser.visualizer import ViserDebugVisualizer, _direction
 
 MODEL = FakeEnv(1).sim.mj_model
 RED, BLUE = (1.0, 0.0, 0.0, 0.25), (0.0, 0.0, 1.0, 0.75)

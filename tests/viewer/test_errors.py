@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mjlab.viewer.errors import RenderingUnavailableError
+from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
 
 
 def test_a_missing_egl_is_called_so_and_what_to_install_is_named(monkeypatch) -> None:

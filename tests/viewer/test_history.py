@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjlab.viewer.history import TermHistory
+from mjlab.viewer.base import TermHistory
 
 
 def test_only_the_latest_points_are_kept_and_averaged_over_finite_ones() -> None:

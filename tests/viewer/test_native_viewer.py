@@ -12,13 +12,17 @@ import torch
 from viewer_fakes import FakeEnv, push
 
 from mjlab.viewer import NativeMujocoViewer, RenderingUnavailableError, ViewerConfig
-from mjlab.viewer.base import ViewerAction
-from mjlab.viewer.history import TermHistory
+from mjlab.viewer.base import TermHistory, ViewerAction
 from mjlab.viewer.native import keys
 from mjlab.viewer.native.keys import _ACTIONS, action_of_key
-from mjlab.viewer.native.perturbation import MousePush
-from mjlab.viewer.native.reward_plots import plot_scale, reward_figures
-from mjlab.viewer.native.viewer import PlotCfg, compute_viewports, make_empty_figure
+from mjlab.viewer.native.viewer import (
+    MousePush,
+    PlotCfg,
+    compute_viewports,
+    make_empty_figure,
+    plot_scale,
+    reward_figures,
+)
 
 
 def test_keys_are_none_that_mujocos_window_uses_itself() -> None:

@@ -13,7 +13,7 @@ import torch
 from viewer_fakes import FakeEnv
 
 from mjlab.viewer import OffscreenRenderer, RenderingUnavailableError, ViewerConfig
-from mjlab.viewer.gl_context import open_renderer
+from mjlab.viewer.offscreen_renderer import open_renderer
 from mjlab.viewer.viewer_config import OriginType
 
 
@@ -99,7 +99,7 @@ def test_the_scenes_own_model_is_left_alone() -> None:
 def test_it_renders_without_a_display_although_mujoco_was_imported_before_mjlab() -> None:
     code = (
         "import mujoco\n"
-        "from mjlab.viewer.gl_context import open_renderer\n"
+        "from mjlab.viewer.offscreen_renderer import open_renderer\n"
         "open_renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).close()"
     )
     without = ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mjlab.viewer.pacing import SPEEDS, RateMeter, RealtimePacer, speed_label
+from mjlab.viewer.base import SPEEDS, RateMeter, RealtimePacer, speed_label
 
 
 def steps_taken(pacer: RealtimePacer) -> int:

@@ -16,8 +16,8 @@ from viewer_fakes import FakeEnv, push
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.utils.wrappers import VideoRecorder
+from mjlab.utils.wrappers.video_recorder import ClipWriter
 from mjlab.viewer import RenderingUnavailableError
-from mjlab.viewer.clip_writer import ClipWriter
 
 ACTION = torch.zeros(1, 1)
 
@@ -260,7 +260,7 @@ def test_an_encoder_that_fails_is_an_error_and_leaves_no_file(tmp_path) -> None:
 def test_a_clip_is_finished_when_the_program_ends_without_closing_it(tmp_path) -> None:
     code = (
         "import sys, numpy as np; from pathlib import Path\n"
-        "from mjlab.viewer.clip_writer import ClipWriter\n"
+        "from mjlab.utils.wrappers.video_recorder import ClipWriter\n"
         "clip = ClipWriter(Path(sys.argv[1]) / 'x.mp4', 30)\n"
         "clip.add(np.zeros((4, 4, 3), np.uint8)); sys.exit(3)"
     )
@@ -271,7 +271,7 @@ def test_a_clip_is_finished_when_the_program_ends_without_closing_it(tmp_path) -
 def test_the_partial_clip_of_a_killed_program_goes_with_the_next_clip(tmp_path) -> None:
     code = (
         "import sys, time, numpy as np; from pathlib import Path\n"
-        "from mjlab.viewer.clip_writer import ClipWriter\n"
+        "from mjlab.utils.wrappers.video_recorder import ClipWriter\n"
         "clip = ClipWriter(Path(sys.argv[1]) / 'x.mp4', 30)\n"
         "clip.add(np.zeros((4, 4, 3), np.uint8)); print('recording', flush=True); time.sleep(60)"
     )

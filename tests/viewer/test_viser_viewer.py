@@ -15,10 +15,15 @@ from viewer_fakes import FakeEnv, push
 from mjlab.viewer import ViewerConfig, ViserPlayViewer
 from mjlab.viewer.base import ViewerStatus
 from mjlab.viewer.viewer_config import OriginType
-from mjlab.viewer.viser.checkpoints import checkpoint_number, local_checkpoints
-from mjlab.viewer.viser.controls import status_html
 from mjlab.viewer.viser.scene import MjlabViserScene
-from mjlab.viewer.viser.viewer import CheckpointManager, UpdateReason, format_time_ago
+from mjlab.viewer.viser.viewer import (
+    CheckpointManager,
+    UpdateReason,
+    checkpoint_number,
+    format_time_ago,
+    local_checkpoints,
+    status_html,
+)
 
 FOLLOW = {"origin_type": OriginType.ASSET_ROOT, "entity_name": "cartpole"}
 

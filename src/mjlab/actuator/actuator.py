@@ -8,26 +8,178 @@ spec, and in every physics substep turns the entity's commands into their contro
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import mujoco
 import torch
 
-from mjlab.actuator._columns import EnvIds, write_columns
-from mjlab.actuator._delay import delay_command as delay_command
-from mjlab.actuator._delay import delay_rows
-from mjlab.actuator.command import ActuatorCmd as ActuatorCmd
-from mjlab.actuator.command import TransmissionType as TransmissionType
-from mjlab.actuator.command import read_command
 from mjlab.utils.buffers import DelayBuffer
+from mjlab.utils.indexing import Columns, EnvIds, read_columns, write_columns
 from mjlab.utils.mujoco import CommandField as CommandField
 from mjlab.utils.mujoco import control_columns
+from mjlab.utils.spec import apply_target_overrides
 from mjlab.utils.state import stateful
-from mjlab.utils.substep import is_constant_within_step
 
 if TYPE_CHECKING:
+    import mujoco
+
     from mjlab.entity import Entity, EntityData
+    from mjlab.utils.buffers import DelayBuffer
+    from mjlab.utils.mujoco import CommandField
+
+
+# MERGED mjlab.actuator.actuator: Marks for work whose effect is the same at every physics substep of one environment step.
+#
+# An environment step runs `decimation` physics substeps. Where nothing has to act between them, the
+# engine runs all of them in one dispatch, which is where a CPU run gets its speed. A method is only
+# trusted to be constant when its author says so: a subclass that overrides it loses the mark.
+
+F = TypeVar("F", bound=Callable[..., Any])
+_MARK = "_constant_within_step"
+
+
+def constant_within_step(function: F) -> F:
+    """Mark `function` as having the same effect at every substep of an environment step."""
+    setattr(function, _MARK, True)
+    return function
+
+
+def is_constant_within_step(function: Callable[..., Any]) -> bool:
+    """Return whether `function` (plain or bound) carries the mark of `constant_within_step`."""
+    return bool(getattr(function, _MARK, False))
+
+
+# MERGED mjlab.actuator.actuator: What an actuator is told, and where in an entity's data that stands.
+
+
+class TransmissionType(str, Enum):  # noqa: UP042 (part of the interface)
+    """What an actuator acts on."""
+
+    JOINT = "joint"
+    TENDON = "tendon"
+    SITE = "site"
+
+
+@dataclass
+class ActuatorCmd:
+    """Commands and feedback of one actuator's targets, (N, number of targets) each."""
+
+    position_target: torch.Tensor
+    """Joint position (rad or m) or tendon length (m) to reach."""
+    velocity_target: torch.Tensor
+    """Velocity to reach (rad/s or m/s)."""
+    effort_target: torch.Tensor
+    """Force to add (N m or N), or another input, such as a voltage."""
+    pos: torch.Tensor
+    """Current position. It is never delayed."""
+    vel: torch.Tensor
+    """Current velocity. It is never delayed."""
+
+
+# Fields of EntityData: three targets, position, velocity. None reads as zero.
+_FIELDS = {
+    TransmissionType.JOINT: (
+        "joint_pos_target", "joint_vel_target", "joint_effort_target", "joint_pos", "joint_vel",
+    ),
+    TransmissionType.TENDON: (
+        "tendon_len_target", "tendon_vel_target", "tendon_effort_target", "tendon_len",
+        "tendon_vel",
+    ),
+    TransmissionType.SITE: (None, None, "site_effort_target", None, None),
+}  # fmt: skip
+_POSITIONS = {"position": 0, "velocity": 1, "effort": 2}
+
+
+def target_field(transmission: TransmissionType, command: CommandField) -> str | None:
+    """Return the field of EntityData that holds one kind of target."""
+    return _FIELDS[transmission][_POSITIONS[command]]
+
+
+def read_command(data: EntityData, transmission: TransmissionType, columns: Columns) -> ActuatorCmd:
+    """Return the command and feedback in some columns; views of live data if they are a slice."""
+    names = _FIELDS[transmission]
+    values = [
+        None if name is None else read_columns(getattr(data, name), columns) for name in names
+    ]
+    present = [value for value in values if value is not None]
+    zeros = torch.zeros_like(present[0]) if len(present) < len(names) else present[0]
+    return ActuatorCmd(*(zeros if value is None else value for value in values))
+
+
+# MERGED mjlab.actuator.actuator: Delaying commands: all targets of a line together, so that they are always of the same age.
+
+
+def delay_command(
+    buffer: DelayBuffer,
+    position_target: torch.Tensor,
+    velocity_target: torch.Tensor,
+    effort_target: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Append a command, (N, n) three times, to a delay line, and return the delayed command.
+
+    One line for all three keeps them together: they are always of the same age.
+    """
+    position, velocity, effort = delay_rows(
+        buffer, (position_target, velocity_target, effort_target), None
+    )
+    return position, velocity, effort
+
+
+def delay_rows(
+    buffer: DelayBuffer, values: tuple[torch.Tensor, ...], env_ids: EnvIds
+) -> tuple[torch.Tensor, ...]:
+    """Return `values`, each (N, n_i), delayed together by one line.
+
+    With `env_ids` these environments have just been reset: their lines start anew, filled with
+    what they are given, and all other lines stay as they are. Only the rows `env_ids` of the
+    result mean something then.
+    """
+    widths = [value.shape[1] for value in values]
+    together = torch.cat(values, dim=1) if len(values) > 1 else values[0]
+    if env_ids is None:
+        buffer.append(together)
+        return buffer.compute().split(widths, dim=1)
+    if not buffer.is_initialized:
+        # A line takes its shape from what is appended first; then all environments are new to it.
+        buffer.append(torch.zeros_like(together))
+        buffer.reset()
+    buffer.backfill(together, env_ids)
+    return buffer.peek().split(widths, dim=1)
+
+
+# MERGED mjlab.actuator.actuator: What the two kinds of actuator groups share: who may join one, and who shares a delay line.
+
+_METHODS = ("compute", "compute_after_reset", "get_command", "apply_delay", "apply_controls")
+
+
+def acts_like(actuator: Actuator, base: type[Actuator]) -> bool:
+    """Return whether the actuator's class left alone what a group does in place of a `base`."""
+    return all(getattr(type(actuator), name) is getattr(base, name) for name in _METHODS)
+
+
+def delay_settings(actuator: Actuator) -> tuple[Any, ...]:
+    """Return what has to agree for actuators to share a delay line."""
+    cfg = actuator.cfg
+    return (
+        type(actuator),
+        actuator.transmission_type,
+        cfg.delay_min_lag,
+        cfg.delay_max_lag,
+        cfg.delay_hold_prob,
+        cfg.delay_update_period,
+        cfg.delay_per_env_phase,
+    )
+
+
+def share_line(members: Sequence[Actuator], num_envs: int, device: str) -> DelayBuffer:
+    """Make one delay line for actuators with equal settings, and have the first one reset it."""
+    line = members[0].make_delay_buffer(num_envs, device)
+    for k, actuator in enumerate(members):
+        actuator.join_group(line, resets_delay=k == 0)
+    return line
 
 
 @dataclass(kw_only=True)
@@ -370,3 +522,51 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
 
 def _int_tensor(values: list[int], device: str) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.int64, device=device)
+
+
+# MERGED mjlab.actuator.actuator: Actuators whose control law MuJoCo evaluates: the control is a command, passed through.
+
+
+class DirectActuator(Actuator[ActuatorCfgT]):
+    """An actuator whose controls are the commands in `command_fields`, one block of columns each.
+
+    Many of them are written to the simulation at once, by `BuiltinActuatorGroup`. A subclass
+    defines `command_fields`, and what it adds to the spec: `_add_element`, or all of `edit_spec`.
+    """
+
+    shares_delay: ClassVar[bool] = False
+    """Whether actuators of this class with equal delay settings have one lag per environment."""
+
+    @property
+    def command_fields(self) -> tuple[CommandField, ...]:
+        """Which commands the elements read."""
+        raise NotImplementedError(f"{type(self).__name__} must define command_fields.")
+
+    def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
+        """Add one element for each target, and write the config's properties to the target."""
+        for name in target_names:
+            self._mjs_actuators.append(self._add_element(spec, name))
+            self._override_target(spec, name)
+
+    def _add_element(self, spec: mujoco.MjSpec, target_name: str) -> mujoco.MjsActuator:
+        """Add the element of one target to `spec` and return it."""
+        raise NotImplementedError(
+            f"{type(self).__name__} must define _add_element(spec, target_name), or edit_spec."
+        )
+
+    @constant_within_step
+    def compute(self, cmd: ActuatorCmd) -> torch.Tensor:
+        """Return the commands that the elements read, (N, number of controls)."""
+        commands = [getattr(cmd, f"{field}_target") for field in self.command_fields]
+        return commands[0] if len(commands) == 1 else torch.cat(commands, dim=1)
+
+    def _override_target(self, spec: mujoco.MjSpec, target_name: str) -> None:
+        """Write the config's armature, friction loss and damping to a target in `spec`."""
+        apply_target_overrides(
+            spec,
+            target_name,
+            self.transmission_type,
+            armature=self.cfg.armature,
+            frictionloss=self.cfg.frictionloss,
+            viscous_damping=self.cfg.viscous_damping,
+        )

@@ -6,25 +6,29 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeGuard
 
-from mjlab.actuator._columns import (
-    Columns,
-    EnvIds,
-    as_columns,
-    read_columns,
-    write_columns,
+from mjlab.actuator.actuator import (
+    Actuator,
+    DirectActuator,
+    acts_like,
+    delay_rows,
+    delay_settings,
+    share_line,
+    target_field,
 )
-from mjlab.actuator._delay import delay_rows
-from mjlab.actuator._grouping import acts_like, delay_settings, share_line
-from mjlab.actuator.actuator import Actuator
 from mjlab.actuator.builtin_actuator import (
     BuiltinMotorActuator,
     BuiltinMuscleActuator,
     BuiltinPositionActuator,
     BuiltinVelocityActuator,
 )
-from mjlab.actuator.command import target_field
-from mjlab.actuator.direct import DirectActuator
 from mjlab.utils.buffers import DelayBuffer
+from mjlab.utils.indexing import (
+    Columns,
+    EnvIds,
+    as_columns,
+    read_columns,
+    write_columns,
+)
 
 if TYPE_CHECKING:
     from mjlab.entity import EntityData

@@ -8,18 +8,24 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 
 import torch
 
-from mjlab.actuator._columns import (
+from mjlab.actuator.actuator import (
+    Actuator,
+    ActuatorCmd,
+    TransmissionType,
+    acts_like,
+    delay_rows,
+    delay_settings,
+    read_command,
+    share_line,
+)
+from mjlab.actuator.pd_actuator import IdealPdActuator
+from mjlab.utils.buffers import DelayBuffer
+from mjlab.utils.indexing import (
     Columns,
     EnvIds,
     as_columns,
     write_columns,
 )
-from mjlab.actuator._delay import delay_rows
-from mjlab.actuator._grouping import acts_like, delay_settings, share_line
-from mjlab.actuator.actuator import Actuator, ActuatorCmd, TransmissionType
-from mjlab.actuator.command import read_command
-from mjlab.actuator.pd_actuator import IdealPdActuator
-from mjlab.utils.buffers import DelayBuffer
 
 if TYPE_CHECKING:
     from mjlab.entity import EntityData

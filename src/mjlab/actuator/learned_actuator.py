@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
-from mjlab.actuator._columns import EnvIds
 from mjlab.actuator.actuator import ActuatorCmd
 from mjlab.actuator.dc_actuator import DcMotorActuator, DcMotorActuatorCfg, dc_motor_clip
 from mjlab.utils.buffers import CircularBuffer
+from mjlab.utils.indexing import EnvIds
 
 if TYPE_CHECKING:
     import mujoco

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import mujoco
 import torch
 
-from mjlab.actuator._columns import EnvIds, as_rows
 from mjlab.actuator.actuator import Actuator, ActuatorCfg, ActuatorCmd
 from mjlab.sim.simulation import SharedField
+from mjlab.utils.indexing import EnvIds, as_rows
 from mjlab.utils.spec import create_motor_actuator
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import mujoco
 
-from mjlab.actuator.actuator import ActuatorCfg, TransmissionType
-from mjlab.actuator.direct import DirectActuator
+from mjlab.actuator.actuator import ActuatorCfg, DirectActuator, TransmissionType
 from mjlab.compat import older_names
 from mjlab.utils.mujoco import CommandField, control_inputs, detect_command_field
 

@@ -20,14 +20,12 @@ import numpy as np
 import torch
 
 from mjlab.actuator.actuator import Actuator, ActuatorCfg
-from mjlab.envs.mdp._indexing import resolve_env_ids
-from mjlab.envs.mdp.dr._actuator_selection import selected_actuators
-from mjlab.envs.mdp.dr._core import FieldRow, randomize
-from mjlab.envs.mdp.dr._selection import BODY, GEOM, SITE
+from mjlab.envs.mdp.dr._core import BODY, GEOM, ROBOT, SITE, FieldRow, randomize
 from mjlab.envs.mdp.dr._table import TABLE
-from mjlab.envs.mdp.dr._terms import ROBOT
-from mjlab.managers.model_fields import derived_fields
+from mjlab.envs.mdp.dr.actuator import selected_actuators
+from mjlab.managers.event_manager import derived_fields
 from mjlab.sim.randomization import RecomputeLevel
+from mjlab.utils.indexing import resolve_env_ids
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -213,7 +211,7 @@ def flat_orientation(
     env: ManagerBasedRlEnv, std: float, asset_cfg: SceneEntityCfg = ROBOT
 ) -> torch.Tensor:
     """Reward a body that stands upright: `upright` without terrain sensors."""
-    from mjlab.tasks.velocity.mdp._shared import single_body, tilt_of
+    from mjlab.tasks.velocity.mdp.rewards import single_body, tilt_of
 
     asset: Entity = env.scene[asset_cfg.name]
     body = single_body(env, asset_cfg)
@@ -458,9 +456,8 @@ def run_sim(
         renderer: Without effect.
     """
     from mjlab.scripts.csv_to_npz_run import record_motion
-    from mjlab.tasks.tracking.motion_csv import read_csv
     from mjlab.tasks.tracking.motion_file import npz_path, write_motion
-    from mjlab.tasks.tracking.motion_kinematics import make_motion, resampled
+    from mjlab.tasks.tracking.motion_recording import make_motion, read_csv, resampled
 
     robot = scene["robot"]
     recording = read_csv(input_file, input_fps, joint_names, line_range)

@@ -19,14 +19,12 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.envs.mdp._checks import require_command
-from mjlab.envs.mdp._indexing import columns
-from mjlab.managers.build_checks import checked_when_built
-from mjlab.managers.env_ids import as_ids
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.tasks.velocity.mdp import feet_rewards
-from mjlab.tasks.velocity.mdp._shared import if_commanded
-from mjlab.tasks.velocity.mdp.sensor_checks import Source, site_columns
+from mjlab.managers.term_checks import checked_when_built, require_command
+from mjlab.tasks.velocity.mdp import rewards as feet_rewards
+from mjlab.tasks.velocity.mdp.observations import Source, site_columns
+from mjlab.tasks.velocity.mdp.rewards import if_commanded
+from mjlab.utils.indexing import as_ids, columns
 from mjlab.utils.state import capture_state, restore_state
 
 if TYPE_CHECKING:

@@ -2,17 +2,654 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from mjlab.compat import offers_older_attributes, older_names
-from mjlab.entity.indexing import EntityIndexing
-from mjlab.entity.kinematics import KinematicsReader
-from mjlab.entity.kinematics import compute_velocity_from_cvel as compute_velocity_from_cvel
-from mjlab.entity.state_writer import EnvIds, StateWriter
+from mjlab.entity.indexing import Addresses, EntityIndexing, Ids
+from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse, quat_from_matrix, quat_mul
 from mjlab.utils.state import stateful
+
+if TYPE_CHECKING:
+    from mjlab.entity.indexing import EntityIndexing
+
+
+# MERGED mjlab.entity.data: Poses and velocities of one entity's root, bodies, geoms and sites.
+
+
+def compute_velocity_from_cvel(
+    pos: torch.Tensor, subtree_com: torch.Tensor, cvel: torch.Tensor
+) -> torch.Tensor:
+    """Return the world velocity of points fixed to bodies: (..., 6) linear, angular.
+
+    MuJoCo's `cvel = (omega, v_c)` is the velocity of the point of the (extended) body that is now
+    at `c`, the centre of mass of the body's whole tree. Hence `v(p) = v_c - omega x (c - p)`.
+
+    Args:
+        pos: (..., 3) world positions p.
+        subtree_com: (..., 3) centre of mass of the tree that each point's body belongs to.
+        cvel: (..., 6) `cvel` of each point's body.
+    """
+    linear = _linear_velocity(pos, subtree_com, cvel)
+    return torch.cat((linear, cvel[..., :3].expand_as(linear)), dim=-1)
+
+
+def _linear_velocity(
+    pos: torch.Tensor, subtree_com: torch.Tensor, cvel: torch.Tensor
+) -> torch.Tensor:
+    return torch.linalg.cross(cvel[..., :3], pos - subtree_com).add_(cvel[..., 3:])
+
+
+class KinematicsReader:
+    """The properties of `EntityData` that read where things are and how they move.
+
+    `EntityData` says what they have in common.
+    """
+
+    indexing: EntityIndexing
+    data: Any
+    model: Any
+    device: str
+    gravity_vec_w: torch.Tensor
+    forward_vec_b: torch.Tensor
+    _views: dict[Any, torch.Tensor]
+
+    def _find_addresses(self) -> None:
+        ix, device = self.indexing, self.device
+        self._joint_q = Addresses(ix.joint_q_adr, device)
+        self._joint_v = Addresses(ix.joint_v_adr, device)
+        self._bodies = Addresses(ix.body_ids, device)
+        self._body_trees = Addresses(ix.body_tree_ids, device)
+        self._geoms = Addresses(ix.geom_ids, device)
+        self._geom_bodies = Addresses(ix.geom_body_ids, device)
+        self._geom_trees = Addresses(ix.geom_tree_ids, device)
+        self._sites = Addresses(ix.site_ids, device)
+        self._site_bodies = Addresses(ix.site_body_ids, device)
+        self._site_trees = Addresses(ix.site_tree_ids, device)
+        self._tendons = Addresses(ix.tendon_ids, device)
+        self._ctrl = Addresses(ix.ctrl_ids, device)
+        self._forces = Addresses(ix.force_ids, device)
+        self._root = Addresses([ix.root_body_id], device)
+        # A free joint's addresses always follow each other.
+        start_q, start_v = ix.free_joint_q_adr[:1].tolist(), ix.free_joint_v_adr[:1].tolist()
+        self._free_q = slice(start_q[0], start_q[0] + 7) if start_q else slice(0, 0)
+        self._free_v = slice(start_v[0], start_v[0] + 6) if start_v else slice(0, 0)
+
+    # Reading a simulation field.
+
+    def _columns(self, name: str, at: Addresses) -> torch.Tensor:
+        """Return the entity's part of a data field: a view, kept, where addresses allow one."""
+        key = (name, id(at))
+        view = self._views.get(key)
+        if view is not None:
+            return view
+        field = getattr(self.data, name)
+        if isinstance(at.all, torch.Tensor):
+            # Several times as fast as indexing with the tensor.
+            return field.index_select(1, at.all)
+        # Tensors of data fields live as long as the simulation, so views of them do too.
+        view = self._views[key] = field[:, at.all]
+        return view
+
+    def _root_row(self, name: str) -> torch.Tensor:
+        key = (name, "root")
+        view = self._views.get(key)
+        if view is None:
+            view = self._views[key] = getattr(self.data, name)[:, self.indexing.root_body_id]
+        return view
+
+    def _tree_com(self, trees: Addresses) -> torch.Tensor:
+        """Return centres of mass of trees, (N, n, 3), or (N, 1, 3) if all are the root's tree.
+
+        An entity with several top-level bodies has several trees, each with its own centre.
+        """
+        if trees.constant == self.indexing.root_body_id:
+            return self._columns("subtree_com", self._root)
+        return self._columns("subtree_com", trees)
+
+    # Root link.
+
+    @property
+    def root_link_pos_w(self) -> torch.Tensor:
+        """(N, 3) position of the root link."""
+        return self._root_row("xpos")
+
+    @property
+    def root_link_quat_w(self) -> torch.Tensor:
+        """(N, 4) orientation of the root link."""
+        return self._root_row("xquat")
+
+    @property
+    def root_link_pose_w(self) -> torch.Tensor:
+        """(N, 7) position and orientation of the root link."""
+        return torch.cat((self.root_link_pos_w, self.root_link_quat_w), dim=-1)
+
+    @property
+    def root_link_vel_w(self) -> torch.Tensor:
+        """(N, 6) velocity of the root link's origin."""
+        return torch.cat((self.root_link_lin_vel_w, self.root_link_ang_vel_w), dim=-1)
+
+    @property
+    def root_link_lin_vel_w(self) -> torch.Tensor:
+        """(N, 3) linear velocity of the root link's origin."""
+        return self._root_linear("xpos")
+
+    @property
+    def root_link_ang_vel_w(self) -> torch.Tensor:
+        """(N, 3) angular velocity of the root link."""
+        return self._root_row("cvel")[:, :3]
+
+    @property
+    def root_link_lin_vel_b(self) -> torch.Tensor:
+        """(N, 3) linear velocity of the root link's origin, in its frame."""
+        return quat_apply_inverse(self.root_link_quat_w, self.root_link_lin_vel_w)
+
+    @property
+    def root_link_ang_vel_b(self) -> torch.Tensor:
+        """(N, 3) angular velocity of the root link, in its frame."""
+        return quat_apply_inverse(self.root_link_quat_w, self.root_link_ang_vel_w)
+
+    @property
+    def projected_gravity_b(self) -> torch.Tensor:
+        """(N, 3) unit vector down, in the frame of the root link."""
+        return quat_apply_inverse(self.root_link_quat_w, self.gravity_vec_w)
+
+    @property
+    def heading_w(self) -> torch.Tensor:
+        """(N,) angle from world x to the horizontal projection of the root's forward direction."""
+        forward = quat_apply(self.root_link_quat_w, self.forward_vec_b)
+        return torch.atan2(forward[:, 1], forward[:, 0])
+
+    # Root centre of mass.
+
+    @property
+    def root_com_pos_w(self) -> torch.Tensor:
+        """(N, 3) centre of mass of the root body."""
+        return self._root_row("xipos")
+
+    @property
+    def root_com_quat_w(self) -> torch.Tensor:
+        """(N, 4) orientation of the root body's inertial frame."""
+        offset = self.model.body_iquat[:, self.indexing.root_body_id]
+        return quat_mul(self.root_link_quat_w, offset)
+
+    @property
+    def root_com_pose_w(self) -> torch.Tensor:
+        """(N, 7) pose of the root body's inertial frame."""
+        return torch.cat((self.root_com_pos_w, self.root_com_quat_w), dim=-1)
+
+    @property
+    def root_com_vel_w(self) -> torch.Tensor:
+        """(N, 6) velocity of the root body's centre of mass."""
+        return torch.cat((self.root_com_lin_vel_w, self.root_com_ang_vel_w), dim=-1)
+
+    @property
+    def root_com_lin_vel_w(self) -> torch.Tensor:
+        """(N, 3) linear velocity of the root body's centre of mass."""
+        return self._root_linear("xipos")
+
+    @property
+    def root_com_ang_vel_w(self) -> torch.Tensor:
+        """(N, 3) angular velocity of the root body."""
+        return self._root_row("cvel")[:, :3]
+
+    @property
+    def root_com_lin_vel_b(self) -> torch.Tensor:
+        """(N, 3) velocity of the root body's centre of mass, in the frame of the root LINK."""
+        return quat_apply_inverse(self.root_link_quat_w, self.root_com_lin_vel_w)
+
+    @property
+    def root_com_ang_vel_b(self) -> torch.Tensor:
+        """(N, 3) angular velocity of the root body, in the frame of the root LINK."""
+        return quat_apply_inverse(self.root_link_quat_w, self.root_com_ang_vel_w)
+
+    def _root_linear(self, position: str) -> torch.Tensor:
+        # The root is the top-level body of its own tree.
+        return _linear_velocity(
+            self._root_row(position), self._root_row("subtree_com"), self._root_row("cvel")
+        )
+
+    # Bodies.
+
+    @property
+    def body_link_pos_w(self) -> torch.Tensor:
+        """(N, nb, 3) positions of the links."""
+        return self._columns("xpos", self._bodies)
+
+    @property
+    def body_link_quat_w(self) -> torch.Tensor:
+        """(N, nb, 4) orientations of the links."""
+        return self._columns("xquat", self._bodies)
+
+    @property
+    def body_link_pose_w(self) -> torch.Tensor:
+        """(N, nb, 7) poses of the links."""
+        return torch.cat((self.body_link_pos_w, self.body_link_quat_w), dim=-1)
+
+    @property
+    def body_link_lin_vel_w(self) -> torch.Tensor:
+        """(N, nb, 3) linear velocities of the links' origins."""
+        return self._body_linear("xpos")
+
+    @property
+    def body_link_ang_vel_w(self) -> torch.Tensor:
+        """(N, nb, 3) angular velocities of the links."""
+        return self._columns("cvel", self._bodies)[..., :3]
+
+    @property
+    def body_link_vel_w(self) -> torch.Tensor:
+        """(N, nb, 6) velocities of the links' origins."""
+        return torch.cat((self.body_link_lin_vel_w, self.body_link_ang_vel_w), dim=-1)
+
+    @property
+    def body_com_pos_w(self) -> torch.Tensor:
+        """(N, nb, 3) centres of mass of the bodies."""
+        return self._columns("xipos", self._bodies)
+
+    @property
+    def body_com_quat_w(self) -> torch.Tensor:
+        """(N, nb, 4) orientations of the bodies' inertial frames."""
+        return quat_mul(self.body_link_quat_w, self.model.body_iquat[:, self._bodies.all])
+
+    @property
+    def body_com_pose_w(self) -> torch.Tensor:
+        """(N, nb, 7) poses of the bodies' inertial frames."""
+        return torch.cat((self.body_com_pos_w, self.body_com_quat_w), dim=-1)
+
+    @property
+    def body_com_lin_vel_w(self) -> torch.Tensor:
+        """(N, nb, 3) linear velocities of the bodies' centres of mass."""
+        return self._body_linear("xipos")
+
+    @property
+    def body_com_ang_vel_w(self) -> torch.Tensor:
+        """(N, nb, 3) angular velocities of the bodies."""
+        return self.body_link_ang_vel_w
+
+    @property
+    def body_com_vel_w(self) -> torch.Tensor:
+        """(N, nb, 6) velocities of the bodies' centres of mass."""
+        return torch.cat((self.body_com_lin_vel_w, self.body_com_ang_vel_w), dim=-1)
+
+    def link_lin_vel_of(self, bodies: slice | torch.Tensor) -> torch.Tensor:
+        """Return linear velocities of the origins of links `bodies` of the entity, (N, n, 3).
+
+        This is faster than choosing from `body_link_lin_vel_w`, which computes those of all links.
+        """
+        ids = self._bodies.tensor[bodies]
+        if self._body_trees.constant == self.indexing.root_body_id:
+            com = self._columns("subtree_com", self._root)
+        else:
+            com = self.data.subtree_com.index_select(1, self._body_trees.tensor[bodies])
+        pos, cvel = (field.index_select(1, ids) for field in (self.data.xpos, self.data.cvel))
+        return _linear_velocity(pos, com, cvel)
+
+    def link_ang_vel_of(self, bodies: slice | torch.Tensor) -> torch.Tensor:
+        """Return angular velocities of links `bodies` of the entity, (N, n, 3)."""
+        return self.data.cvel.index_select(1, self._bodies.tensor[bodies])[..., :3]
+
+    def _body_linear(self, position: str) -> torch.Tensor:
+        return _linear_velocity(
+            self._columns(position, self._bodies),
+            self._tree_com(self._body_trees),
+            self._columns("cvel", self._bodies),
+        )
+
+    @property
+    def body_external_wrench(self) -> torch.Tensor:
+        """(N, nb, 6) applied force and torque, at the bodies' centres of mass."""
+        return self._columns("xfrc_applied", self._bodies)
+
+    @property
+    def body_external_force(self) -> torch.Tensor:
+        """(N, nb, 3) applied forces."""
+        return self.body_external_wrench[..., :3]
+
+    @property
+    def body_external_torque(self) -> torch.Tensor:
+        """(N, nb, 3) applied torques."""
+        return self.body_external_wrench[..., 3:]
+
+    # Geoms and sites.
+
+    @property
+    def geom_pos_w(self) -> torch.Tensor:
+        """(N, number of geoms, 3) positions of the geoms."""
+        return self._columns("geom_xpos", self._geoms)
+
+    @property
+    def geom_quat_w(self) -> torch.Tensor:
+        """(N, number of geoms, 4) orientations; the largest component is positive."""
+        return quat_from_matrix(self._columns("geom_xmat", self._geoms))
+
+    @property
+    def geom_pose_w(self) -> torch.Tensor:
+        """(N, number of geoms, 7) poses of the geoms."""
+        return torch.cat((self.geom_pos_w, self.geom_quat_w), dim=-1)
+
+    @property
+    def geom_lin_vel_w(self) -> torch.Tensor:
+        """(N, number of geoms, 3) linear velocities of the geoms' centres."""
+        return _linear_velocity(
+            self.geom_pos_w,
+            self._tree_com(self._geom_trees),
+            self._columns("cvel", self._geom_bodies),
+        )
+
+    @property
+    def geom_ang_vel_w(self) -> torch.Tensor:
+        """(N, number of geoms, 3) angular velocities of the geoms."""
+        return self._columns("cvel", self._geom_bodies)[..., :3]
+
+    @property
+    def geom_vel_w(self) -> torch.Tensor:
+        """(N, number of geoms, 6) velocities of the geoms' centres."""
+        return torch.cat((self.geom_lin_vel_w, self.geom_ang_vel_w), dim=-1)
+
+    @property
+    def site_pos_w(self) -> torch.Tensor:
+        """(N, number of sites, 3) positions of the sites."""
+        return self._columns("site_xpos", self._sites)
+
+    @property
+    def site_quat_w(self) -> torch.Tensor:
+        """(N, number of sites, 4) orientations; the largest component is positive."""
+        return quat_from_matrix(self._columns("site_xmat", self._sites))
+
+    @property
+    def site_pose_w(self) -> torch.Tensor:
+        """(N, number of sites, 7) poses of the sites."""
+        return torch.cat((self.site_pos_w, self.site_quat_w), dim=-1)
+
+    @property
+    def site_lin_vel_w(self) -> torch.Tensor:
+        """(N, number of sites, 3) linear velocities of the sites."""
+        return _linear_velocity(
+            self.site_pos_w,
+            self._tree_com(self._site_trees),
+            self._columns("cvel", self._site_bodies),
+        )
+
+    @property
+    def site_ang_vel_w(self) -> torch.Tensor:
+        """(N, number of sites, 3) angular velocities of the sites."""
+        return self._columns("cvel", self._site_bodies)[..., :3]
+
+    @property
+    def site_vel_w(self) -> torch.Tensor:
+        """(N, number of sites, 6) velocities of the sites."""
+        return torch.cat((self.site_lin_vel_w, self.site_ang_vel_w), dim=-1)
+
+
+# MERGED mjlab.entity.data: Writing the state of one entity into the simulation.
+
+EnvIds = torch.Tensor | slice | None
+
+
+def assign(
+    field: torch.Tensor,
+    value: torch.Tensor,
+    env_ids: EnvIds,
+    columns: slice | torch.Tensor | int,
+) -> None:
+    """Write `value` into rows `env_ids` and `columns` of `field`; tensors select their product."""
+    if env_ids is None:
+        field[:, columns] = value
+    elif isinstance(columns, torch.Tensor) and not isinstance(env_ids, slice):
+        field[_row_numbers(env_ids)[:, None], columns] = value
+    else:
+        field[env_ids, columns] = value
+
+
+def rows(field: torch.Tensor, env_ids: EnvIds) -> torch.Tensor:
+    """Return the rows `env_ids` of `field`."""
+    return field if env_ids is None else field[env_ids]
+
+
+def as_values(
+    value: Any, width: int, name: str, device: str, broadcasts: bool = False
+) -> torch.Tensor:
+    """Return a tensor, array or number as float32, whose last dimension must be `width`.
+
+    With `broadcasts` it may be 1: one value for all elements.
+
+    Raises:
+        ValueError: the width is another.
+    """
+    if not isinstance(value, torch.Tensor):
+        # Copied, because torch warns about arrays that it may not write to.
+        value = torch.as_tensor(np.array(value), dtype=torch.float32, device=device)
+    elif value.dtype != torch.float32:
+        value = value.to(device, torch.float32)
+    widths = (1, width) if broadcasts else (width,)
+    if value.ndim > 0 and value.shape[-1] not in widths:
+        raise ValueError(
+            f"{name} has {value.shape[-1]} values per environment (shape {tuple(value.shape)}), "
+            f"but {width} are to be written. Give a tensor of shape (number of envs, {width})."
+        )
+    return value
+
+
+def _row_numbers(env_ids: torch.Tensor) -> torch.Tensor:
+    env_ids = torch.as_tensor(env_ids)
+    return env_ids.nonzero().flatten() if env_ids.dtype == torch.bool else env_ids
+
+
+class StateWriter:
+    """The writers of `EntityData`.
+
+    `env_ids` is None (all), a slice, a boolean mask or a one-dimensional tensor of indices; element
+    ids, which count within the entity, may also be a list. Tensors of both select their product.
+    Values are tensors or arrays of any float type; the simulation holds float32.
+
+    Writes go straight to the simulation. What derives from the state (`body_link_pos_w`, velocities
+    of links, sensors, ...) keeps its old values until the next `sim.forward()`.
+
+    Environments whose poses or joint positions were written are noted in `moved_envs`: forces of the
+    last substep do not belong to them any more, so `env.step` and `env.reset` recompute these.
+    """
+
+    indexing: EntityIndexing
+    data: Any
+    model: Any
+    device: str
+    default_root_state: torch.Tensor
+    moved_envs: torch.Tensor | None
+    is_fixed_base: bool
+    is_articulated: bool
+    is_actuated: bool
+    _joint_q: Addresses
+    _joint_v: Addresses
+    _bodies: Addresses
+    _ctrl: Addresses
+    _free_q: slice
+    _free_v: slice
+
+    def write_root_state(self, root_state: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write pose and velocity of the root link, (k, 13): see the next two writers."""
+        self._require_floating("write_root_state")
+        root_state = as_values(root_state, 13, "The root state", self.device)
+        self.write_root_pose(root_state[..., :7], env_ids)
+        self.write_root_velocity(root_state[..., 7:], env_ids)
+
+    def write_root_pose(self, pose: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write the world pose of the root link, (k, 7): position, quaternion (w, x, y, z).
+
+        Raises:
+            ValueError: the entity has a fixed base, or the width is wrong.
+        """
+        self._require_floating("write_root_pose")
+        pose = as_values(pose, 7, "The root pose", self.device)
+        assign(self.data.qpos, pose, env_ids, self._free_q)
+        self._note_move(env_ids)
+
+    def write_root_velocity(self, velocity: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write the world velocity of the root link, (k, 6): linear (of its origin), angular.
+
+        MuJoCo keeps the angular part in the body frame, so it is rotated by the orientation that
+        `qpos` holds now: write the pose first.
+
+        Raises:
+            ValueError: the entity has a fixed base, or the width is wrong.
+        """
+        quat, linear, angular = self._read_velocity("write_root_velocity", velocity, env_ids)
+        angular_b = quat_apply_inverse(quat, angular)
+        assign(self.data.qvel, torch.cat((linear, angular_b), dim=-1), env_ids, self._free_v)
+
+    def write_root_velocity_b(self, velocity_b: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write the velocity of the root link given in its own frame, (k, 6): linear, angular.
+
+        Raises:
+            ValueError: the entity has a fixed base, or the width is wrong.
+        """
+        quat, linear_b, angular_b = self._read_velocity(
+            "write_root_velocity_b", velocity_b, env_ids
+        )
+        linear = quat_apply(quat, linear_b)
+        assign(self.data.qvel, torch.cat((linear, angular_b), dim=-1), env_ids, self._free_v)
+
+    def write_root_com_velocity(self, velocity: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write the world velocity of the root body's centre of mass, (k, 6): linear, angular.
+
+        The origin of the link then moves with `v_com - omega x (R body_ipos)`.
+
+        Raises:
+            ValueError: the entity has a fixed base, or the width is wrong.
+        """
+        quat, linear, angular = self._read_velocity("write_root_com_velocity", velocity, env_ids)
+        offset_b = rows(self.model.body_ipos[:, self.indexing.root_body_id], env_ids)
+        linear = linear - torch.linalg.cross(angular, quat_apply(quat, offset_b))
+        self.write_root_velocity(torch.cat((linear, angular), dim=-1), env_ids)
+
+    def write_joint_state(
+        self,
+        position: torch.Tensor,
+        velocity: torch.Tensor,
+        joint_ids: Ids = None,
+        env_ids: EnvIds = None,
+    ) -> None:
+        """Write joint positions and velocities, (k, number of joints) or (k, 1) each."""
+        self.write_joint_position(position, joint_ids, env_ids)
+        self.write_joint_velocity(velocity, joint_ids, env_ids)
+
+    def write_joint_position(
+        self, position: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
+    ) -> None:
+        """Write joint positions, (k, number of joints) or (k, 1).
+
+        Raises:
+            ValueError: the entity has no joints, or the width is wrong.
+        """
+        self._require_articulated("write_joint_position")
+        columns, width = self._joint_q.select(joint_ids)
+        position = as_values(position, width, "The joint position", self.device, broadcasts=True)
+        assign(self.data.qpos, position, env_ids, columns)
+        self._note_move(env_ids)
+
+    def write_joint_velocity(
+        self, velocity: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
+    ) -> None:
+        """Write joint velocities, (k, number of joints) or (k, 1).
+
+        Raises:
+            ValueError: the entity has no joints, or the width is wrong.
+        """
+        self._require_articulated("write_joint_velocity")
+        columns, width = self._joint_v.select(joint_ids)
+        velocity = as_values(velocity, width, "The joint velocity", self.device, broadcasts=True)
+        assign(self.data.qvel, velocity, env_ids, columns)
+
+    def write_external_wrench(
+        self,
+        force: torch.Tensor | None,
+        torque: torch.Tensor | None,
+        body_ids: Sequence[int] | torch.Tensor | slice | None = None,
+        env_ids: EnvIds = None,
+    ) -> None:
+        """Set force and torque on bodies, (k, number of bodies, 3) each; None leaves a half alone.
+
+        World frame, acting at the bodies' centres of mass. They persist until they are overwritten
+        or the environment is reset.
+        """
+        columns, _ = self._bodies.select(body_ids)
+        wrench = self.data.xfrc_applied
+        for value, half, what in ((force, slice(0, 3), "force"), (torque, slice(3, 6), "torque")):
+            if value is not None:
+                values = as_values(value, 3, f"The external {what}", self.device)
+                assign(wrench[..., half], values, env_ids, columns)
+
+    def write_ctrl(self, ctrl: torch.Tensor, ctrl_ids: Ids = None, env_ids: EnvIds = None) -> None:
+        """Write controls of actuators, (k, number of controls), or (k, 1) for all alike.
+
+        `ctrl_ids` are ids of actuators as `find_actuators` returns them. Controls follow each other
+        by actuator: most have one, `<pid>`, `<dcmotor>` and `<orientation>` may have several.
+
+        Raises:
+            ValueError: the entity has no configured actuators, or the width is wrong.
+        """
+        if not self.is_actuated:
+            raise ValueError(
+                "write_ctrl: this entity has no actuators. List them in "
+                "EntityCfg.articulation.actuators."
+            )
+        columns, width = self._ctrl.select(self.indexing.control_columns(ctrl_ids))
+        ctrl = as_values(ctrl, width, "The control", self.device, broadcasts=True)
+        assign(self.data.ctrl, ctrl, env_ids, columns)
+
+    def write_mocap_pose(self, pose: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write the pose of the mocap root, (k, 7): position, quaternion (w, x, y, z).
+
+        Raises:
+            ValueError: the root is no mocap body, or the width is wrong.
+        """
+        mocap_id = self.indexing.mocap_id
+        if mocap_id is None:
+            raise ValueError(
+                "write_mocap_pose: the root of this entity is no mocap body. Place a floating "
+                "entity with write_root_pose."
+            )
+        pose = as_values(pose, 7, "The mocap pose", self.device)
+        assign(self.data.mocap_pos, pose[..., :3], env_ids, mocap_id)
+        assign(self.data.mocap_quat, pose[..., 3:], env_ids, mocap_id)
+        self._note_move(env_ids)
+
+    def _note_move(self, env_ids: EnvIds) -> None:
+        # A new tensor, because one that was made under `inference_mode` cannot be written outside.
+        if self.moved_envs is None:
+            size = len(self.default_root_state)
+            moved = torch.zeros(size, dtype=torch.bool, device=self.device)
+        else:
+            moved = self.moved_envs.clone()
+        moved[slice(None) if env_ids is None else env_ids] = True
+        self.moved_envs = moved
+
+    def _read_velocity(
+        self, what: str, velocity: torch.Tensor, env_ids: EnvIds
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the orientations of the root now, (k, 4), and both halves of `velocity`, (k, 3).
+
+        Raises `ValueError`, naming the writer `what`, for a fixed base or a wrong width.
+        """
+        self._require_floating(what)
+        velocity = as_values(velocity, 6, "The root velocity", self.device)
+        quat = rows(self.data.qpos[:, self._free_q], env_ids)[:, 3:7]
+        halves = velocity.expand(len(quat), 6)
+        return quat, halves[:, :3], halves[:, 3:]
+
+    def _require_floating(self, what: str) -> None:
+        if self.is_fixed_base:
+            raise ValueError(
+                f"{what}: this entity has a fixed base. Place it with write_mocap_pose, or give "
+                "its root body a free joint."
+            )
+
+    def _require_articulated(self, what: str) -> None:
+        if not self.is_articulated:
+            raise ValueError(f"{what}: this entity has no joints other than a free one.")
 
 
 @offers_older_attributes

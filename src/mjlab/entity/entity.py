@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mujoco
+import torch
 
 from mjlab.actuator import (
     Actuator,
@@ -17,17 +18,19 @@ from mjlab.actuator import (
     FusedActuatorGroup,
     TransmissionType,
 )
-from mjlab.entity.actuation import build_actuators
-from mjlab.entity.commands import EntityCommands
-from mjlab.entity.data import EntityData
+from mjlab.entity.building import (
+    add_key,
+    build_actuators,
+    find_joints,
+    place_body,
+    resolve_initial_state,
+    short_name,
+    take_keys,
+    take_options,
+)
+from mjlab.entity.data import EntityData, EnvIds, as_values, assign
 from mjlab.entity.indexing import EntityIndexing as EntityIndexing
-from mjlab.entity.indexing import build_indexing
-from mjlab.entity.initial_state import add_key, resolve_initial_state, take_keys
-from mjlab.entity.initialize import make_data
-from mjlab.entity.lookup import Found, NamedElements
-from mjlab.entity.options import take_options
-from mjlab.entity.state_writer import EnvIds
-from mjlab.entity.structure import find_joints, place_body
+from mjlab.entity.indexing import Ids, build_indexing
 from mjlab.utils import spec_config as spec_cfg
 from mjlab.utils.lab_api.string import resolve_matching_names
 from mjlab.utils.spec import auto_wrap_fixed_base_mocap, compile_composed
@@ -35,7 +38,504 @@ from mjlab.utils.state import stateful
 from mjlab.utils.xml import fix_spec_xml, strip_buffer_textures
 
 if TYPE_CHECKING:
+    from mjlab.entity.data import EntityData
+    from mjlab.entity.indexing import EntityIndexing
     from mjlab.entity.variants import VariantMetadata
+
+
+# MERGED mjlab.entity.entity: Names of an entity's elements, and finding elements by regular expression.
+
+Found = tuple[list[int], list[str]]
+
+
+class NamedElements:
+    """What an entity has, by name.
+
+    Names are without the prefix of the scene: the part after the last "/". Elements without a name
+    are called "". Every `find_*` takes regular expressions that must match a whole name, and
+    returns indices within the entity and names, in the entity's order, or, with `preserve_order`,
+    pattern by pattern. With a subset of names to choose from, indices count in that subset.
+
+    All raise `ValueError`, listing the candidates, if a pattern matches nothing or two patterns
+    match one name.
+    """
+
+    _spec: mujoco.MjSpec
+    _free_joint: mujoco.MjsJoint | None
+    _joints: tuple[mujoco.MjsJoint, ...]
+
+    def _names(self, kind: str) -> tuple[str, ...]:
+        return _short_names(getattr(self._spec, kind))
+
+    @property
+    def body_names(self) -> tuple[str, ...]:
+        """Names of the bodies, without the world."""
+        return self._names("bodies")[1:]
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints, without a free joint."""
+        return _short_names(self._joints)
+
+    @property
+    def all_joint_names(self) -> tuple[str, ...]:
+        """Names of all joints, a free joint included."""
+        return self._names("joints")
+
+    @property
+    def geom_names(self) -> tuple[str, ...]:
+        """Names of the geoms."""
+        return self._names("geoms")
+
+    @property
+    def site_names(self) -> tuple[str, ...]:
+        """Names of the sites."""
+        return self._names("sites")
+
+    @property
+    def tendon_names(self) -> tuple[str, ...]:
+        """Names of the tendons."""
+        return self._names("tendons")
+
+    @property
+    def actuator_names(self) -> tuple[str, ...]:
+        """Names of all actuators in the spec, also of those that no config lists."""
+        return self._names("actuators")
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return self._names("cameras")
+
+    @property
+    def light_names(self) -> tuple[str, ...]:
+        """Names of the lights."""
+        return self._names("lights")
+
+    @property
+    def material_names(self) -> tuple[str, ...]:
+        """Names of the materials."""
+        return self._names("materials")
+
+    @property
+    def texture_names(self) -> tuple[str, ...]:
+        """Names of the textures."""
+        return self._names("textures")
+
+    @property
+    def pair_names(self) -> tuple[str, ...]:
+        """Names of the contact pairs."""
+        return self._names("pairs")
+
+    @property
+    def num_bodies(self) -> int:
+        """Number of bodies, without the world."""
+        return len(self.body_names)
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints, without a free joint."""
+        return len(self._joints)
+
+    @property
+    def num_geoms(self) -> int:
+        """Number of geoms."""
+        return len(self.geom_names)
+
+    @property
+    def num_sites(self) -> int:
+        """Number of sites."""
+        return len(self.site_names)
+
+    @property
+    def num_tendons(self) -> int:
+        """Number of tendons."""
+        return len(self.tendon_names)
+
+    @property
+    def num_actuators(self) -> int:
+        """Number of actuators in the spec."""
+        return len(self.actuator_names)
+
+    @property
+    def num_cameras(self) -> int:
+        """Number of cameras."""
+        return len(self.camera_names)
+
+    @property
+    def num_lights(self) -> int:
+        """Number of lights."""
+        return len(self.light_names)
+
+    @property
+    def num_materials(self) -> int:
+        """Number of materials."""
+        return len(self.material_names)
+
+    @property
+    def num_textures(self) -> int:
+        """Number of textures."""
+        return len(self.texture_names)
+
+    @property
+    def num_pairs(self) -> int:
+        """Number of contact pairs."""
+        return len(self.pair_names)
+
+    def find_bodies(self, name_keys: str | Sequence[str], preserve_order: bool = False) -> Found:
+        """Find bodies by name."""
+        return _find("bodies", name_keys, self.body_names, None, preserve_order)
+
+    def find_joints(
+        self,
+        name_keys: str | Sequence[str],
+        joint_subset: Sequence[str] | None = None,
+        preserve_order: bool = False,
+    ) -> Found:
+        """Find joints by name; the free joint is none of them."""
+        return _find("joints", name_keys, self.joint_names, joint_subset, preserve_order)
+
+    def find_geoms(
+        self,
+        name_keys: str | Sequence[str],
+        geom_subset: Sequence[str] | None = None,
+        preserve_order: bool = False,
+    ) -> Found:
+        """Find geoms by name."""
+        return _find("geoms", name_keys, self.geom_names, geom_subset, preserve_order)
+
+    def find_sites(
+        self,
+        name_keys: str | Sequence[str],
+        site_subset: Sequence[str] | None = None,
+        preserve_order: bool = False,
+    ) -> Found:
+        """Find sites by name."""
+        return _find("sites", name_keys, self.site_names, site_subset, preserve_order)
+
+    def find_tendons(
+        self,
+        name_keys: str | Sequence[str],
+        tendon_subset: Sequence[str] | None = None,
+        preserve_order: bool = False,
+    ) -> Found:
+        """Find tendons by name."""
+        return _find("tendons", name_keys, self.tendon_names, tendon_subset, preserve_order)
+
+    def find_actuators(
+        self,
+        name_keys: str | Sequence[str],
+        actuator_subset: Sequence[str] | None = None,
+        preserve_order: bool = False,
+    ) -> Found:
+        """Find actuators by name."""
+        return _find("actuators", name_keys, self.actuator_names, actuator_subset, preserve_order)
+
+    def find_cameras(
+        self,
+        name_keys: str | Sequence[str],
+        camera_subset: Sequence[str] | None = None,
+        preserve_order: bool = False,
+    ) -> Found:
+        """Find cameras by name."""
+        return _find("cameras", name_keys, self.camera_names, camera_subset, preserve_order)
+
+    def find_lights(
+        self,
+        name_keys: str | Sequence[str],
+        light_subset: Sequence[str] | None = None,
+        preserve_order: bool = False,
+    ) -> Found:
+        """Find lights by name."""
+        return _find("lights", name_keys, self.light_names, light_subset, preserve_order)
+
+    def find_materials(
+        self,
+        name_keys: str | Sequence[str],
+        material_subset: Sequence[str] | None = None,
+        preserve_order: bool = False,
+    ) -> Found:
+        """Find materials by name."""
+        return _find("materials", name_keys, self.material_names, material_subset, preserve_order)
+
+    def find_textures(
+        self,
+        name_keys: str | Sequence[str],
+        texture_subset: Sequence[str] | None = None,
+        preserve_order: bool = False,
+    ) -> Found:
+        """Find textures by name."""
+        return _find("textures", name_keys, self.texture_names, texture_subset, preserve_order)
+
+    def find_pairs(
+        self,
+        name_keys: str | Sequence[str],
+        pair_subset: Sequence[str] | None = None,
+        preserve_order: bool = False,
+    ) -> Found:
+        """Find contact pairs by name."""
+        return _find("pairs", name_keys, self.pair_names, pair_subset, preserve_order)
+
+
+def _short_names(elements: Sequence[Any]) -> tuple[str, ...]:
+    return tuple(short_name(element.name) for element in elements)
+
+
+def _find(
+    kind: str,
+    name_keys: str | Sequence[str],
+    names: Sequence[str],
+    subset: Sequence[str] | None,
+    preserve_order: bool,
+) -> Found:
+    try:
+        return resolve_matching_names(
+            name_keys, names if subset is None else subset, preserve_order
+        )
+    except ValueError as error:
+        raise ValueError(f"Cannot find {kind} by {name_keys!r}. {error}") from None
+
+
+# MERGED mjlab.entity.entity: Commands to an entity: targets of its actuators, and state written into the simulation.
+
+
+class EntityCommands:
+    """The setters and writers of `Entity`.
+
+    `env_ids` is None (all), a slice, a boolean mask or a one-dimensional tensor of indices; element
+    ids count within the entity and may also be a list. Tensors of both select their product. Values
+    are tensors or arrays of any float type. All raise `ValueError` if a width is wrong or the entity
+    has no such elements.
+
+    Setters store a target for the next `write_data_to_sim`; writers change the simulation now, and
+    what derives from the state follows at the next `sim.forward()`.
+    """
+
+    @property
+    def data(self) -> EntityData:
+        """State and targets of the entity."""
+        raise NotImplementedError
+
+    def set_joint_position_target(
+        self, position: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
+    ) -> None:
+        """Set position targets (k, number of joints), in radians or metres."""
+        _set_target(self.data.joint_pos_target, position, joint_ids, env_ids, "joint")
+
+    def set_joint_velocity_target(
+        self, velocity: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
+    ) -> None:
+        """Set velocity targets (k, number of joints)."""
+        _set_target(self.data.joint_vel_target, velocity, joint_ids, env_ids, "joint")
+
+    def set_joint_effort_target(
+        self, effort: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
+    ) -> None:
+        """Set effort targets (k, number of joints)."""
+        _set_target(self.data.joint_effort_target, effort, joint_ids, env_ids, "joint")
+
+    def set_tendon_len_target(
+        self, length: torch.Tensor, tendon_ids: Ids = None, env_ids: EnvIds = None
+    ) -> None:
+        """Set length targets (k, number of tendons)."""
+        _set_target(self.data.tendon_len_target, length, tendon_ids, env_ids, "tendon")
+
+    def set_tendon_vel_target(
+        self, velocity: torch.Tensor, tendon_ids: Ids = None, env_ids: EnvIds = None
+    ) -> None:
+        """Set velocity targets (k, number of tendons)."""
+        _set_target(self.data.tendon_vel_target, velocity, tendon_ids, env_ids, "tendon")
+
+    def set_tendon_effort_target(
+        self, effort: torch.Tensor, tendon_ids: Ids = None, env_ids: EnvIds = None
+    ) -> None:
+        """Set effort targets (k, number of tendons)."""
+        _set_target(self.data.tendon_effort_target, effort, tendon_ids, env_ids, "tendon")
+
+    def set_site_effort_target(
+        self, effort: torch.Tensor, site_ids: Ids = None, env_ids: EnvIds = None
+    ) -> None:
+        """Set effort targets (k, number of sites)."""
+        _set_target(self.data.site_effort_target, effort, site_ids, env_ids, "site")
+
+    def seed_position_targets(self, env_ids: EnvIds = None) -> None:
+        """Where no joint position target was set since the reset, take the current position.
+
+        A reset leaves all targets at zero. Position actuators would then pull towards zero until
+        the first action: after the reset events have placed the joints, this holds them there.
+        """
+        target = self.data.joint_pos_target
+        if target.shape[1] == 0:
+            return
+        rows = slice(None) if env_ids is None else env_ids
+        chosen = target[rows]
+        target[rows] = torch.where(chosen == 0.0, self.data.joint_pos[rows], chosen)
+
+    def write_root_state_to_sim(self, root_state: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write the root link's pose and velocity (k, 13)."""
+        self.data.write_root_state(root_state, env_ids)
+
+    def write_root_link_pose_to_sim(self, root_pose: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write the root link's world pose (k, 7): position, quaternion (w, x, y, z)."""
+        self.data.write_root_pose(root_pose, env_ids)
+
+    def write_root_link_velocity_to_sim(
+        self, root_velocity: torch.Tensor, env_ids: EnvIds = None
+    ) -> None:
+        """Write the root link's world velocity (k, 6). Write its pose before."""
+        self.data.write_root_velocity(root_velocity, env_ids)
+
+    def write_root_link_velocity_b_to_sim(
+        self, root_velocity_b: torch.Tensor, env_ids: EnvIds = None
+    ) -> None:
+        """Write the root link's velocity given in its own frame (k, 6). Write its pose before."""
+        self.data.write_root_velocity_b(root_velocity_b, env_ids)
+
+    def write_root_com_velocity_to_sim(
+        self, root_velocity: torch.Tensor, env_ids: EnvIds = None
+    ) -> None:
+        """Write the world velocity of the root body's centre of mass (k, 6), after its pose."""
+        self.data.write_root_com_velocity(root_velocity, env_ids)
+
+    def write_joint_state_to_sim(
+        self,
+        position: torch.Tensor,
+        velocity: torch.Tensor,
+        joint_ids: Ids = None,
+        env_ids: EnvIds = None,
+    ) -> None:
+        """Write joint positions and velocities (k, number of joints); (k, 1) for all joints alike."""
+        self.data.write_joint_state(position, velocity, joint_ids, env_ids)
+
+    def write_joint_position_to_sim(
+        self, position: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
+    ) -> None:
+        """Write joint positions (k, number of joints); (k, 1) for all joints alike."""
+        self.data.write_joint_position(position, joint_ids, env_ids)
+
+    def write_joint_velocity_to_sim(
+        self, velocity: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
+    ) -> None:
+        """Write joint velocities (k, number of joints); (k, 1) for all joints alike."""
+        self.data.write_joint_velocity(velocity, joint_ids, env_ids)
+
+    def write_external_wrench_to_sim(
+        self,
+        forces: torch.Tensor | None,
+        torques: torch.Tensor | None,
+        env_ids: EnvIds = None,
+        body_ids: Sequence[int] | torch.Tensor | slice | None = None,
+    ) -> None:
+        """Set world force and torque on bodies (k, number of bodies, 3), at their mass centres."""
+        self.data.write_external_wrench(forces, torques, body_ids, env_ids)
+
+    def write_ctrl_to_sim(
+        self, ctrl: torch.Tensor, ctrl_ids: Ids = None, env_ids: EnvIds = None
+    ) -> None:
+        """Write controls (k, number of controls) of actuators `ctrl_ids`, as `find_actuators` counts.
+
+        See `EntityData.write_ctrl` for actuators with several controls.
+        """
+        self.data.write_ctrl(ctrl, ctrl_ids, env_ids)
+
+    def write_mocap_pose_to_sim(self, mocap_pose: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write the pose of the mocap root (k, 7): position, quaternion (w, x, y, z)."""
+        self.data.write_mocap_pose(mocap_pose, env_ids)
+
+
+def _set_target(
+    target: torch.Tensor, value: torch.Tensor, ids: Ids, env_ids: EnvIds, what: str
+) -> None:
+    width = target.shape[1]
+    if width == 0:
+        raise ValueError(
+            f"This entity has no {what} targets: it has no {what}s"
+            + ("." if what == "joint" else f", or no configured actuator acts on a {what}.")
+        )
+    columns: slice | torch.Tensor
+    if ids is None:
+        columns = slice(None)
+    elif isinstance(ids, slice):
+        columns, width = ids, len(range(*ids.indices(width)))
+    else:
+        columns = torch.as_tensor(ids, device=target.device)
+        if columns.dtype == torch.bool:
+            columns = columns.nonzero().flatten()
+        width = columns.shape[0]
+    values = as_values(value, width, f"The {what} target", str(target.device), broadcasts=True)
+    assign(target, values, env_ids, columns)
+
+
+# MERGED mjlab.entity.entity: The tensors of an entity's data, made once its model is compiled.
+
+
+def make_data(
+    entity: Entity,
+    indexing: EntityIndexing,
+    model: Any,
+    data: Any,
+    device: str,
+) -> EntityData:
+    """Return the data of `entity`, with defaults from its config and all targets zero."""
+    num_envs = data.nworld
+    num_joints = len(indexing.joints)
+
+    def row(values: Any) -> torch.Tensor:
+        """Return one row for each environment, each its own memory."""
+        one = torch.as_tensor(values, dtype=torch.float32, device=device)
+        return one.expand(num_envs, *one.shape).clone()
+
+    def zeros(width: int) -> torch.Tensor:
+        return torch.zeros(num_envs, width, dtype=torch.float32, device=device)
+
+    articulation = entity.cfg.articulation
+    factor = 1.0 if articulation is None else articulation.soft_joint_pos_limit_factor
+    limits = _joint_limits(model, indexing)
+    num_tendons = len(indexing.tendons) if entity.has_tendon_actuators else 0
+    return EntityData(
+        indexing=indexing,
+        data=data,
+        model=model,
+        device=device,
+        default_root_state=row(entity.initial_state.root_state),
+        default_joint_pos=row(entity.initial_state.joint_pos),
+        default_joint_vel=row(entity.initial_state.joint_vel),
+        default_joint_pos_limits=limits,
+        joint_pos_limits=limits.clone(),
+        soft_joint_pos_limits=_shrunk(limits, factor),
+        gravity_vec_w=row((0.0, 0.0, -1.0)),
+        forward_vec_b=row((1.0, 0.0, 0.0)),
+        is_fixed_base=entity.is_fixed_base,
+        is_articulated=entity.is_articulated,
+        is_actuated=entity.is_actuated,
+        joint_pos_target=zeros(num_joints),
+        joint_vel_target=zeros(num_joints),
+        joint_effort_target=zeros(num_joints),
+        tendon_len_target=zeros(num_tendons),
+        tendon_vel_target=zeros(num_tendons),
+        tendon_effort_target=zeros(num_tendons),
+        site_effort_target=zeros(len(indexing.sites) if entity.has_site_actuators else 0),
+        encoder_bias=zeros(num_joints),
+    )
+
+
+def _joint_limits(model: Any, indexing: EntityIndexing) -> torch.Tensor:
+    """Return (N, nj, 2) limits, infinite where the compiled joint is not limited."""
+    ids = indexing.joint_ids.long()
+    # Read from the simulation, because variants of an entity may have limits of their own.
+    limits = model.jnt_range[:, ids].clone().float()
+    limited = model.jnt_limited[..., ids].bool()
+    limits[..., 0].masked_fill_(~limited, -torch.inf)
+    limits[..., 1].masked_fill_(~limited, torch.inf)
+    return limits
+
+
+def _shrunk(limits: torch.Tensor, factor: float) -> torch.Tensor:
+    """Return limits scaled by `factor` about their middle; infinite ones stay so."""
+    middle = limits.mean(dim=-1)
+    half = 0.5 * factor * (limits[..., 1] - limits[..., 0])
+    shrunk = torch.stack((middle - half, middle + half), dim=-1)
+    return torch.where(torch.isinf(limits), limits, shrunk)
 
 
 @dataclass

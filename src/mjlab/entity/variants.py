@@ -7,6 +7,7 @@ its variant compiles to.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
@@ -14,21 +15,25 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
-from mjlab.entity._variant_assignment import allocate_worlds as allocate_worlds
-from mjlab.entity._variant_assignment import assign_worlds, resolve_assignment
-from mjlab.entity._variant_merge import merge_specs, refuse_references
-from mjlab.entity._variant_signatures import RESERVED_NAME_PREFIXES as RESERVED_NAME_PREFIXES
-from mjlab.entity._variant_signatures import BodySignature as BodySignature
-from mjlab.entity._variant_signatures import GeomRole as GeomRole
-from mjlab.entity._variant_signatures import GeomSignature as GeomSignature
-from mjlab.entity._variant_signatures import JointSignature as JointSignature
-from mjlab.entity._variant_signatures import validate_variant_specs as validate_variant_specs
-from mjlab.entity._variant_signatures import walk_bodies
-from mjlab.entity._variant_slots import Shared, Slot, VariantGeomSpec, split_geoms
-from mjlab.entity._variant_slots import SlotKey as SlotKey
-from mjlab.entity._variant_slots import VariantSlot as VariantSlot
-from mjlab.entity._variant_values import KINDS, VariantTable
 from mjlab.entity.entity import Entity, EntityCfg
+from mjlab.entity.indexing import element_id
+from mjlab.entity.variant_merge import RESERVED_NAME_PREFIXES as RESERVED_NAME_PREFIXES
+from mjlab.entity.variant_merge import BodySignature as BodySignature
+from mjlab.entity.variant_merge import GeomRole as GeomRole
+from mjlab.entity.variant_merge import GeomSignature as GeomSignature
+from mjlab.entity.variant_merge import JointSignature as JointSignature
+from mjlab.entity.variant_merge import (
+    Shared,
+    Slot,
+    VariantGeomSpec,
+    merge_specs,
+    refuse_references,
+    split_geoms,
+    walk_bodies,
+)
+from mjlab.entity.variant_merge import SlotKey as SlotKey
+from mjlab.entity.variant_merge import VariantSlot as VariantSlot
+from mjlab.entity.variant_merge import validate_variant_specs as validate_variant_specs
 from mjlab.sim.randomization import (
     CONSTANTS_AT_QPOS0,
     FIXED_CONSTANTS,
@@ -38,7 +43,260 @@ from mjlab.sim.randomization import (
     put_variant_model,
 )
 from mjlab.sim.randomization import VARIANT_DEPENDENT_FIELDS as VARIANT_DEPENDENT_FIELDS
+from mjlab.utils.mujoco import control_columns, dof_width, force_columns, qpos_width
 from mjlab.utils.spec import compile_composed, compile_spec
+
+# MERGED mjlab.entity.variants: Which variant each environment gets.
+
+Assignment = dict[str, float] | Callable[[int], Sequence[int]] | None
+
+
+def allocate_worlds(weights: tuple[float, ...], nworld: int) -> list[int]:
+    """Return the variant of each of `nworld` environments, by weight, in contiguous blocks.
+
+    Each variant gets its quota `w_i / sum(w) * nworld`, rounded down. What is left over goes to the
+    largest remainders, of equal ones to the earlier variant.
+
+    Raises:
+        ValueError: a weight is negative or not finite, or all are zero.
+    """
+    bad = [weight for weight in weights if not (math.isfinite(weight) and weight >= 0.0)]
+    total = sum(weights)
+    if bad or not 0.0 < total < math.inf:
+        raise ValueError(
+            f"The weights of variants are {tuple(weights)}; they must be finite, none negative, "
+            "and not all zero. A weight of 0 leaves a variant out."
+        )
+    quotas = [weight / total * nworld for weight in weights]
+    # Quotas that are whole but for rounding, such as 3 * (1 / 3), count as whole.
+    counts = [math.floor(quota + 1e-9) for quota in quotas]
+    remainders = [quota - count for quota, count in zip(quotas, counts, strict=True)]
+    order = sorted(range(len(weights)), key=lambda k: (-round(remainders[k], 9), k))
+    for k in order[: nworld - sum(counts)]:
+        counts[k] += 1
+    return [k for k, count in enumerate(counts) for _ in range(count)]
+
+
+def resolve_assignment(
+    names: tuple[str, ...], assignment: Assignment
+) -> tuple[float, ...] | Callable[[int], Sequence[int]]:
+    """Return one weight for each variant, or the callable that assigns them.
+
+    Raises:
+        ValueError: `assignment` names a variant that does not exist, or its weights make no sense.
+    """
+    if assignment is not None and not isinstance(assignment, dict):
+        return assignment
+    given: dict[str, float] = {} if assignment is None else assignment
+    unknown = [name for name in given if name not in names]
+    if unknown:
+        raise ValueError(
+            f"VariantEntityCfg.assignment names the variants {unknown}, which do not exist. "
+            f"There are: {list(names)}."
+        )
+    weights = tuple(float(given.get(name, 1.0)) for name in names)
+    try:
+        allocate_worlds(weights, 1)
+    except ValueError as error:
+        raise ValueError(f"VariantEntityCfg.assignment is {given}. {error}") from None
+    return weights
+
+
+def assign_worlds(
+    assignment: tuple[float, ...] | Callable[[int], Sequence[int]],
+    names: tuple[str, ...],
+    nworld: int,
+) -> np.ndarray:
+    """Return the variant of each environment, (nworld,) int64.
+
+    Raises:
+        ValueError: a callable returns another number of indices, or one that no variant has.
+    """
+    if not callable(assignment):
+        return np.array(allocate_worlds(assignment, nworld), dtype=np.int64)
+    found = np.asarray(assignment(nworld))
+    if found.shape != (nworld,) or found.dtype.kind not in "iu":
+        raise ValueError(
+            f"VariantEntityCfg.assignment was called with {nworld} and returned an array of shape "
+            f"{found.shape} and type {found.dtype}; it must return {nworld} whole numbers, the "
+            "index of each environment's variant."
+        )
+    outside = sorted({int(k) for k in found if not 0 <= k < len(names)})
+    if outside:
+        raise ValueError(
+            f"VariantEntityCfg.assignment returned the indices {outside}; the variants "
+            f"{list(names)} have the indices 0 to {len(names) - 1}."
+        )
+    return found.astype(np.int64)
+
+
+# MERGED mjlab.entity.variants: What each variant of an entity puts into the fields of a compiled model.
+
+
+# Kinds of elements, with the beginning of the names of their model fields.
+KINDS = {
+    "bodies": ("body_", mujoco.mjtObj.mjOBJ_BODY),
+    "joints": ("jnt_", mujoco.mjtObj.mjOBJ_JOINT),
+    "geoms": ("geom_", mujoco.mjtObj.mjOBJ_GEOM),
+    "sites": ("site_", mujoco.mjtObj.mjOBJ_SITE),
+    "cameras": ("cam_", mujoco.mjtObj.mjOBJ_CAMERA),
+    "lights": ("light_", mujoco.mjtObj.mjOBJ_LIGHT),
+    "tendons": ("tendon_", mujoco.mjtObj.mjOBJ_TENDON),
+    "actuators": ("actuator_", mujoco.mjtObj.mjOBJ_ACTUATOR),
+    "equalities": ("eq_", mujoco.mjtObj.mjOBJ_EQUALITY),
+    "sensors": ("sensor_", mujoco.mjtObj.mjOBJ_SENSOR),
+}
+
+# Real fields are figures. Of whole numbers, most are addresses; these are figures too.
+_WHOLE_FIGURES = frozenset(
+    {"jnt_limited", "jnt_actfrclimited", "jnt_actgravcomp", "site_type", "site_group", "cam_mode"}
+    | {"cam_projection", "cam_resolution", "light_mode", "light_type", "light_active"}
+    | {"light_castshadow", "tendon_limited", "tendon_actfrclimited", "actuator_ctrllimited"}
+    | {"actuator_forcelimited", "actuator_actlimited", "actuator_dyntype", "actuator_gaintype"}
+    | {"actuator_biastype", "actuator_actearly", "eq_active0"}
+)
+
+# These follow from the others, and are computed for the whole scene.
+_DERIVED = frozenset({"body_margin", "dof_length", "dof_M0", "actuator_length0"}) | (
+    frozenset((*FIXED_CONSTANTS, *CONSTANTS_AT_QPOS0)) - {"actuator_biasprm", "eq_data"}
+)
+
+# One row a control, or a force, of which an actuator may have several.
+_CONTROL_FIELDS = frozenset({"actuator_ctrllimited", "actuator_ctrlrange"})
+_FORCE_FIELDS = frozenset({"actuator_gear", "actuator_lengthrange"})
+_ASSET_FIELDS = {
+    "geom_matid": ("materials", mujoco.mjtObj.mjOBJ_MATERIAL),
+    "site_matid": ("materials", mujoco.mjtObj.mjOBJ_MATERIAL),
+    "tendon_matid": ("materials", mujoco.mjtObj.mjOBJ_MATERIAL),
+    "geom_dataid": ("meshes", mujoco.mjtObj.mjOBJ_MESH),
+}
+
+# What a geom has where it is not there: no extent, no mesh, no colour. The rest stays as it is in
+# another variant.
+_ABSENT = {"geom_size": 0, "geom_rbound": 0, "geom_aabb": 0, "geom_dataid": -1, "geom_matid": -1}
+
+
+class VariantTable:
+    """Values of all variants, each compiled alone, with the merged elements that they are for."""
+
+    def __init__(
+        self,
+        models: list[mujoco.MjModel],
+        elements: dict[str, list[tuple[Any, list[int]]]],
+        assets: dict[str, list[list[Any]]],
+    ) -> None:
+        """Hold them.
+
+        Args:
+            models: Each variant compiled alone.
+            elements: By kind, elements of the merged spec, each with its id in every model; -1
+                where a variant does not have it. The first body is the root.
+            assets: By kind, for each variant, the merged element of each of its meshes and
+                materials.
+        """
+        self._models, self._elements, self._assets = models, elements, assets
+        self._root = elements["bodies"][0][0]
+
+    def columns(self, model: mujoco.MjModel) -> list[VariantColumns]:
+        """Return what each variant puts into `model`, compiled from a spec with the merged one."""
+        ids = {
+            kind: np.array([element_id(model, KINDS[kind][1], e) for e, _ in pairs], dtype=int)
+            for kind, pairs in self._elements.items()
+        }
+        assets = {
+            field: [
+                np.array([element_id(model, kind, e) for e in own] + [-1])
+                for own in self._assets[name]
+            ]
+            for field, (name, kind) in _ASSET_FIELDS.items()
+        }
+        return [self._columns_of(k, model, ids, assets) for k in range(len(self._models))]
+
+    def _columns_of(
+        self,
+        k: int,
+        model: mujoco.MjModel,
+        ids: dict[str, np.ndarray],
+        assets: dict[str, list[np.ndarray]],
+    ) -> VariantColumns:
+        fields: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        for kind, pairs in self._elements.items():
+            # Of what this variant does not have, the figures come from one that does.
+            sources = [_first_with(own, k) for _, own in pairs]
+            for name in self._fields_of(kind):
+                values = [getattr(self._models[j], name)[i] for j, i in sources]
+                if name in assets:
+                    values = [assets[name][j][i] for (j, _), i in zip(sources, values, strict=True)]
+                if len(values):
+                    fields[name] = ids[kind], np.stack(values)
+        fields |= self._by_address(k, model, ids["joints"], ids["actuators"])
+        # Where the root starts is the entity's initial state, the same for all.
+        for name in ("body_pos", "body_quat"):
+            targets, values = fields[name]
+            fields[name] = targets[1:], values[1:]
+        absent = np.array([own[k] < 0 for _, own in self._elements["geoms"]], dtype=bool)
+        if absent.any():
+            for name, value in _ABSENT.items():
+                fields[name][1][absent] = value
+            fields["geom_rgba"][1][absent, 3] = 0.0
+        return VariantColumns(fields, ids["geoms"][absent])
+
+    def _fields_of(self, kind: str) -> list[str]:
+        """Return the fields with one row for each element of a kind, that hold figures."""
+        prefix, model = KINDS[kind][0], self._models[0]
+        names = [name for name in dir(model) if name.startswith(prefix)]
+        return [
+            name
+            for name in names
+            if isinstance(array := getattr(model, name), np.ndarray)
+            and name not in _DERIVED | _CONTROL_FIELDS | _FORCE_FIELDS
+            and (array.dtype.kind == "f" or name in _WHOLE_FIGURES or name in _ASSET_FIELDS)
+        ]
+
+    def _by_address(
+        self, k: int, model: mujoco.MjModel, joints: np.ndarray, actuators: np.ndarray
+    ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Return the fields with rows for degrees of freedom, positions, controls and forces."""
+        own = self._models[k]
+        there = [ids[k] for _, ids in self._elements["actuators"]]
+        places: dict[str, list[tuple[int, int]]] = {
+            "dof": [],
+            "qpos": [],
+            "control": _pairs(control_columns(model, actuators), control_columns(own, there)),
+            "force": _pairs(force_columns(model, actuators), force_columns(own, there)),
+        }
+        for joint, (_, ids) in zip(joints, self._elements["joints"], strict=True):
+            kind, joint_there = int(model.jnt_type[joint]), ids[k]
+            for j in range(dof_width(kind)):
+                places["dof"].append((model.jnt_dofadr[joint] + j, own.jnt_dofadr[joint_there] + j))
+            if kind != mujoco.mjtJoint.mjJNT_FREE:
+                for j in range(qpos_width(kind)):
+                    places["qpos"].append(
+                        (model.jnt_qposadr[joint] + j, own.jnt_qposadr[joint_there] + j)
+                    )
+        names = {"qpos0": "qpos", "qpos_spring": "qpos"}
+        names |= {name: "dof" for name in dir(own) if name.startswith("dof_")}
+        names |= dict.fromkeys(_CONTROL_FIELDS, "control") | dict.fromkeys(_FORCE_FIELDS, "force")
+        fields = {}
+        for name, kind in names.items():
+            array = getattr(own, name)
+            is_figure = array.dtype.kind == "f" or name in _WHOLE_FIGURES
+            if places[kind] and is_figure and name not in _DERIVED:
+                here, rows = np.array(places[kind], dtype=int).T
+                fields[name] = here, array[rows]
+        return fields
+
+
+def _pairs(here: list[int], there: list[int]) -> list[tuple[int, int]]:
+    return list(zip(here, there, strict=True))
+
+
+def _first_with(ids: list[int], k: int) -> tuple[int, int]:
+    """Return the variant to take figures from, `k` if it can be, and the id of the element in it."""
+    if ids[k] >= 0:
+        return k, ids[k]
+    return next((j, i) for j, i in enumerate(ids) if i >= 0)
+
 
 InertialMode = Literal["mesh-derived", "diagonal", "fullinertia"]
 """Source of a body's inertia: its geoms, `diaginertia` or `fullinertia`."""
@@ -215,7 +473,7 @@ def _merge(
     slots = [slot for _, own in split for slot in own]
     for k, (name, spec) in enumerate(zip(names, specs, strict=True)):
         refuse_references(name, spec, slots, shared, k)
-    elements = _pairs(specs, bodies, shared)
+    elements = _pairs_variants(specs, bodies, shared)
     slot_ids = [[-1 if geom is None else int(geom.id) for geom in slot.geoms] for slot in slots]
     described = _describe(slots, len(names))
     assets, geoms = merge_specs(names, specs, bodies, [own for _, own in split])
@@ -244,7 +502,7 @@ def _compiled(name: str, spec: mujoco.MjSpec) -> mujoco.MjModel:
         raise ValueError(f"Variant {name!r} does not compile: {error}") from error
 
 
-def _pairs(
+def _pairs_variants(
     specs: list[mujoco.MjSpec], bodies: list[list[mujoco.MjsBody]], shared: list[Shared]
 ) -> dict[str, list[tuple[Any, list[int]]]]:
     """Return by kind the elements that all variants have, with their id in each."""

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 from mjlab.utils.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from mjlab.envs.env_cfg import ManagerBasedRlEnvCfg as ManagerBasedRlEnvCfg
     from mjlab.envs.manager_based_rl_env import ManagerBasedRlEnv as ManagerBasedRlEnv
+    from mjlab.envs.manager_based_rl_env import ManagerBasedRlEnvCfg as ManagerBasedRlEnvCfg
     from mjlab.envs.types import VecEnvObs as VecEnvObs
     from mjlab.envs.types import VecEnvStepReturn as VecEnvStepReturn
 
 _LAZY = {
     "ManagerBasedRlEnv": "mjlab.envs.manager_based_rl_env",
-    "ManagerBasedRlEnvCfg": "mjlab.envs.env_cfg",
+    "ManagerBasedRlEnvCfg": "mjlab.envs.manager_based_rl_env",
     "VecEnvObs": "mjlab.envs.types",
     "VecEnvStepReturn": "mjlab.envs.types",
 }

@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.compat import accept_older_methods
-from mjlab.managers.built_terms import BuiltTermsManager
-from mjlab.managers.debug_vis import DebugVisSwitches
-from mjlab.managers.env_ids import as_ids, is_empty
-from mjlab.managers.finite_mean import finite_mean
 from mjlab.managers.lookup import Lookup
-from mjlab.managers.manager_base import ManagerTermBase
+from mjlab.managers.manager_base import (
+    BuiltTermsManager,
+    DebugVisSwitches,
+    ManagerTermBase,
+    finite_mean,
+)
 from mjlab.managers.null_managers import NullCommandManager as NullCommandManager
+from mjlab.utils.indexing import as_ids, is_empty
 
 if TYPE_CHECKING:
     import viser

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.managers.env_ids import as_index
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
 from mjlab.managers.null_managers import NullCurriculumManager as NullCurriculumManager
+from mjlab.utils.indexing import as_index
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv

@@ -3,36 +3,95 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 import torch
 
 from mjlab.compat import accepts_older_fields
-from mjlab.managers.debug_vis import TermFunctionSwitches
-from mjlab.managers.env_ids import as_ids, is_empty
 from mjlab.managers.lookup import Lookup
-from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
-from mjlab.managers.model_fields import (
-    declared_model_fields,
-    declared_recompute,
-    join_levels,
-)
-from mjlab.managers.model_fields import requires_model_fields as requires_model_fields
+from mjlab.managers.manager_base import ManagerTermBaseCfg, TermFunctionSwitches, TermListManager
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.sim.randomization import RecomputeLevel as RecomputeLevel
+from mjlab.sim.randomization import RecomputeLevel
+from mjlab.utils.indexing import as_ids, is_empty
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
-logger = logging.getLogger(__name__)
 
+# MERGED mjlab.managers.event_manager: What a function that changes the model declares: its fields, and what must be recomputed.
+
+F = TypeVar("F", bound=Callable[..., Any])
+_DERIVED = {
+    RecomputeLevel.set_const_fixed: ("body_subtreemass",),
+    RecomputeLevel.set_const_0: (
+        "dof_invweight0",
+        "body_invweight0",
+        "tendon_length0",
+        "tendon_invweight0",
+        "actuator_acc0",
+    ),
+}
+
+
+def derived_fields(level: RecomputeLevel) -> tuple[str, ...]:
+    """Return the model fields that recomputing at this level writes."""
+    return tuple(f for part, fields in _DERIVED.items() if level & part for f in fields)
+
+
+def join_levels(levels: Iterable[RecomputeLevel]) -> RecomputeLevel:
+    """Return the level that recomputes what any of the given ones does."""
+    joined = 0
+    for level in levels:
+        joined |= level
+    return RecomputeLevel(joined)
+
+
+def requires_model_fields(
+    *fields: str, recompute: RecomputeLevel = RecomputeLevel.none
+) -> Callable[[F], F]:
+    """Declare that a function or class, used as an event, changes these fields of the model.
+
+    The fields, and those that derive from them at the level `recompute`, then get a value for each
+    environment, and the latter are recomputed after the event has fired.
+    """
+
+    def declare(function: F) -> F:
+        declared = dict.fromkeys((*fields, *derived_fields(recompute)))
+        setattr(function, "model_fields", tuple(declared))  # noqa: B010
+        setattr(function, "recompute", RecomputeLevel(recompute))  # noqa: B010
+        return function
+
+    return declare
+
+
+def declared_model_fields(function: Any, params: dict[str, Any]) -> tuple[str, ...]:
+    """Return the model fields that an event's function declares.
+
+    A function that learns from its parameters which field it changes declares a callable instead,
+    which gets the parameters: `function.model_fields(params)`. So may `recompute`.
+    """
+    return tuple(_declared(function, "model_fields", params, ()))
+
+
+def declared_recompute(function: Any, params: dict[str, Any]) -> RecomputeLevel:
+    """Return the level of recomputation that an event's function declares."""
+    return RecomputeLevel(_declared(function, "recompute", params, RecomputeLevel.none))
+
+
+def _declared(function: Any, name: str, params: dict[str, Any], default: Any) -> Any:
+    value = getattr(function, name, default)
+    return value(params) if callable(value) else value
+
+
+logger = logging.getLogger(__name__)
 EventMode = Literal["startup", "reset", "interval", "step"]
 
 # Timers count down in steps, so that rounding must not put an event off by one.
 _TIMER_TOLERANCE = 1e-6
+
 # Far enough back that an environment which never fired is always due.
 _NEVER = -(2**40)
 

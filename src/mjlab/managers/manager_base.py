@@ -9,29 +9,162 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import dataclasses
 import inspect
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NoReturn, Protocol, TypeVar
 
 import torch
 
-from mjlab.managers.build_checks import check_term
-from mjlab.managers.config_edits import changes, plain_values, write_changes
-from mjlab.managers.env_ids import EnvIds, as_index
-from mjlab.managers.error_labels import errors_named
-from mjlab.managers.real_values import check_real
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.managers.table import format_table
-from mjlab.utils.state import stateful
+from mjlab.managers.term_checks import check_real, check_term
+from mjlab.utils.indexing import EnvIds, as_index
+from mjlab.utils.state import SKIP, plain_scalar, stateful
 
 if TYPE_CHECKING:
+    import viser
+
     from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.viewer.debug_visualizer import DebugVisualizer
+
+
+# MERGED mjlab.managers.manager_base: Saying which term an error comes from.
+
+
+@contextlib.contextmanager
+def errors_named(label: str) -> Generator[None]:
+    """Put `label` in front of the message of a `KeyError`, `TypeError` or `ValueError` of the block.
+
+    What a term raises while it is built knows its cause, but not which of many terms it is. The
+    type of the error stays, unless it cannot be made from a message alone; it then becomes the
+    `KeyError`, `TypeError` or `ValueError` that it is derived from.
+    """
+    try:
+        yield
+    except (KeyError, TypeError, ValueError) as error:
+        raise _relabelled(error, label) from error
+
+
+def _relabelled(error: KeyError | TypeError | ValueError, label: str) -> Exception:
+    # A KeyError shows its message as a quoted string, so that it is read from its arguments.
+    details = error.args[0] if len(error.args) == 1 else error
+    message = f"{label}: {details}"
+    try:
+        return type(error)(message)
+    except TypeError:
+        kind = next(k for k in (KeyError, TypeError, ValueError) if isinstance(error, k))
+        return kind(message)
+
+
+# MERGED mjlab.managers.manager_base: What was changed in the configs of terms at run time, by curricula say.
+#
+# Changes are run-time state: a run that resumes has to continue with them. Configs as a whole are
+# not, because whoever resumes may have set other values on purpose.
+
+
+def plain_values(cfg: Any) -> dict[str, Any]:
+    """Return a copy of the plain values in a config, as nested dicts by field or key.
+
+    Plain are numbers, strings, None, tensors, and lists and tuples of plain values.
+    """
+    values: dict[str, Any] = {}
+    for key, value in _items(cfg):
+        if callable(value):
+            continue
+        if _is_branch(value):
+            values[key] = plain_values(value)
+        else:
+            plain = _plain(value)
+            if plain is not SKIP:
+                values[key] = plain
+    return values
+
+
+def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what of `now` differs from `before`; both come from `plain_values`."""
+    changed: dict[str, Any] = {}
+    for key, value in now.items():
+        old = before.get(key)
+        if isinstance(value, dict) and isinstance(old, dict):
+            inner = changes(old, value)
+            if inner:
+                changed[key] = inner
+        elif key not in before or not _same(old, value):
+            changed[key] = value
+    return changed
+
+
+def write_changes(cfg: Any, changed: Mapping[str, Any]) -> None:
+    """Write a result of `changes` into a config."""
+    current = dict(_items(cfg))
+    for key, value in changed.items():
+        if isinstance(value, Mapping) and _is_branch(current.get(key)):
+            write_changes(current[key], value)
+        elif isinstance(cfg, dict):
+            cfg[key] = value
+        else:
+            setattr(cfg, key, value)
+
+
+def _items(cfg: Any) -> list[tuple[str, Any]]:
+    if isinstance(cfg, dict):
+        return [(key, value) for key, value in cfg.items() if isinstance(key, str)]
+    return [(field.name, getattr(cfg, field.name)) for field in dataclasses.fields(cfg)]
+
+
+def _is_branch(value: Any) -> bool:
+    is_instance = dataclasses.is_dataclass(value) and not isinstance(value, type)
+    return isinstance(value, dict) or is_instance
+
+
+def _plain(value: Any) -> Any:
+    """Return a copy of a plain value, of exactly the built-in types, or SKIP."""
+    if isinstance(value, torch.Tensor):
+        return value.clone()
+    if isinstance(value, (list, tuple)):
+        items = [_plain(item) for item in value]
+        if any(item is SKIP for item in items):
+            return SKIP
+        return items if isinstance(value, list) else tuple(items)
+    return plain_scalar(value)
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
+        return torch.equal(a, b)
+    if type(a) in (list, tuple) and type(b) in (list, tuple):
+        return len(a) == len(b) and all(_same(x, y) for x, y in zip(a, b, strict=True))
+    if isinstance(a, torch.Tensor) or isinstance(b, torch.Tensor):
+        return False
+    return bool(a == b)
+
+
+# MERGED mjlab.managers.manager_base: Plain text tables: what printing a manager shows.
+
+
+def format_table(title: str, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """Return a text table with a numbered row for each of `rows`.
+
+    Args:
+        title: One line above the table.
+        header: Names of the columns; a column of row numbers is put before them.
+        rows: As many cells a row as there are columns; cells are shown by `str`.
+    """
+    cells = [["#", *header]]
+    cells += [[str(i), *(str(cell) for cell in row)] for i, row in enumerate(rows)]
+    widths = [max(len(row[column]) for row in cells) for column in range(len(cells[0]))]
+    rule = "+" + "+".join("-" * (width + 2) for width in widths) + "+"
+    lines = [
+        "|" + "|".join(f" {cell:<{width}} " for cell, width in zip(row, widths, strict=True)) + "|"
+        for row in cells
+    ]
+    return "\n".join([title, rule, lines[0], rule, *lines[1:], rule])
+
 
 logger = logging.getLogger(__name__)
-
 T = TypeVar("T")
 
 
@@ -309,3 +442,168 @@ class TermListManager(ManagerBase):
 
 def _function_name(func: Any) -> str:
     return getattr(func, "__qualname__", type(func).__name__)
+
+
+# MERGED mjlab.managers.manager_base: What managers share whose terms are made by their configs' `build`.
+
+
+class BuildsTerm(Protocol):
+    """A config that says in `build` which term it makes."""
+
+    def build(self, env: ManagerBasedRlEnv) -> Any:
+        """Return the term."""
+
+
+class HasCfg(Protocol):
+    """A term that keeps its config."""
+
+    cfg: Any
+
+
+TermT = TypeVar("TermT", bound=HasCfg)
+
+
+class BuiltTermsManager(ManagerBase, Generic[TermT]):
+    """A manager that holds terms by name and keeps its config by reference."""
+
+    _cfg_type: type[BuildsTerm]
+    _term_type: type[TermT]
+
+    def __init__(self, cfg: Mapping[str, Any], env: ManagerBasedRlEnv) -> None:
+        self.cfg = cfg
+        self._terms: dict[str, TermT] = {}
+        super().__init__(env)
+
+    @property
+    def active_terms(self) -> list[str]:
+        """Names of the terms, in order."""
+        return list(self._terms)
+
+    def get_term(self, name: str) -> TermT:
+        """Return a term; raises `KeyError`, with the valid names, if there is none."""
+        if name not in self._terms:
+            self._unknown(name, self.active_terms, KeyError)
+        return self._terms[name]
+
+    def _prepare_terms(self) -> None:
+        for name, term_cfg in self._enabled(self.cfg, self._cfg_type):
+            with errors_named(self._label(name)):
+                term = term_cfg.build(self._env)
+            if not isinstance(term, self._term_type):
+                raise TypeError(
+                    f"{self._label(name)}: {type(term_cfg).__name__}.build must return an "
+                    f"instance of {self._term_type.__name__}, got {type(term).__name__}."
+                )
+            self._terms[name] = term
+
+    def _live_cfgs(self) -> dict[str, Any]:
+        return {name: term.cfg for name, term in self._terms.items()}
+
+
+# MERGED mjlab.managers.manager_base: Stand-in for a term that is off and could not be built.
+
+
+class UnreadyTerm:
+    """Is called instead of a term that is off and does not fit, and tries to build it again then.
+
+    A term that is off may be left unfilled: what does not fit matters only when it is switched on.
+
+    Args:
+        build: Builds the term and returns what to call from then on, or raises what was wrong.
+    """
+
+    def __init__(self, build: Callable[[], Any]) -> None:
+        self._build = build
+
+    def __call__(self, env: Any, **params: Any) -> Any:
+        """Build the term, and return its value."""
+        return self._build()(env, **params)
+
+
+# MERGED mjlab.managers.manager_base: Means over environments that one diverged environment does not spoil.
+
+
+def finite_mean(values: torch.Tensor) -> torch.Tensor:
+    """Return the mean over the last axis, leaving out NaN and infinite values; 0 if none is left.
+
+    Args:
+        values: Float tensor (..., E) with one value for each of E environments.
+    """
+    # `isfinite` takes twice the operations.
+    finite = values.abs() < torch.inf
+    return torch.where(finite, values, 0.0).sum(dim=-1) / finite.sum(dim=-1).clamp(min=1)
+
+
+# MERGED mjlab.managers.manager_base: Debug drawings of terms, with a switch for each that viewers offer.
+
+
+class DebugVisSwitches:
+    """Mixin of managers whose terms may draw; all terms are on until switched off."""
+
+    _hidden: frozenset[str] = frozenset()
+
+    def get_visualizable_terms(self) -> list[tuple[str, Any]]:
+        """Return the terms that can draw, as (name, object with `debug_vis`)."""
+        raise NotImplementedError
+
+    def debug_vis(self, visualizer: DebugVisualizer) -> None:
+        """Let every term that can draw, and is switched on, draw."""
+        for name, term in self.get_visualizable_terms():
+            if name not in self._hidden:
+                term.debug_vis(visualizer)
+
+    def set_debug_vis(self, name: str, enabled: bool) -> None:
+        """Switch the drawings of one term on or off.
+
+        Raises `ValueError`, with the valid names, if no such term can draw.
+        """
+        names = [known for known, _ in self.get_visualizable_terms()]
+        if name not in names:
+            raise ValueError(f"No term {name!r} can draw. Terms that can: {names}.")
+        self._hidden = self._hidden - {name} if enabled else self._hidden | {name}
+
+    def create_debug_vis_gui(
+        self, server: viser.ViserServer, on_change: Callable[[], None] | None = None
+    ) -> None:
+        """Add a check box for each term that can draw; `on_change` is called after a change."""
+        for name, _ in self.get_visualizable_terms():
+            self._add_checkbox(server, name, on_change)
+
+    def _add_checkbox(
+        self, server: viser.ViserServer, name: str, on_change: Callable[[], None] | None
+    ) -> None:
+        box = server.gui.add_checkbox(name, initial_value=name not in self._hidden)
+
+        @box.on_update
+        def _(_event: Any) -> None:
+            self.set_debug_vis(name, box.value)
+            if on_change is not None:
+                on_change()
+
+
+class TermFunctionSwitches(DebugVisSwitches):
+    """The same for managers of a list of terms, where the function of a term is what may draw."""
+
+    _term_names: list[str]
+    _term_cfgs: list[Any]
+
+    def get_visualizable_terms(self) -> list[tuple[str, Any]]:
+        """Return the terms that can draw, as (name, function object)."""
+        terms = zip(self._term_names, self._term_cfgs, strict=True)
+        return [
+            (name, cfg.func)
+            for name, cfg in terms
+            if callable(getattr(cfg.func, "debug_vis", None))
+        ]
+
+
+class SensorSwitches(DebugVisSwitches):
+    """The same for the sensors of a scene."""
+
+    def __init__(self, sensors: Mapping[str, Any]) -> None:
+        """Take the sensors by name, as the scene has them."""
+        self._sensors = sensors
+
+    def get_visualizable_terms(self) -> list[tuple[str, Any]]:
+        """Return the sensors that draw, as (name, sensor)."""
+        return [(name, sensor) for name, sensor in self._sensors.items() if sensor.draws]

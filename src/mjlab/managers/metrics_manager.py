@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from mjlab.compat import offers_older_attributes
-from mjlab.managers.env_ids import as_index, is_empty
-from mjlab.managers.finite_mean import finite_mean
-from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
+from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager, finite_mean
 from mjlab.managers.null_managers import NullMetricsManager as NullMetricsManager
+from mjlab.utils.indexing import as_index, is_empty
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv

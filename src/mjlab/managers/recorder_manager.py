@@ -9,8 +9,12 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from mjlab.managers.error_labels import errors_named
-from mjlab.managers.manager_base import ManagerTermBase, ManagerTermBaseCfg, TermListManager
+from mjlab.managers.manager_base import (
+    ManagerTermBase,
+    ManagerTermBaseCfg,
+    TermListManager,
+    errors_named,
+)
 from mjlab.managers.null_managers import NullRecorderManager as NullRecorderManager
 
 if TYPE_CHECKING:

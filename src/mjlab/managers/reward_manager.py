@@ -11,11 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.managers.debug_vis import TermFunctionSwitches
-from mjlab.managers.env_ids import as_index, is_empty
-from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
+from mjlab.managers.manager_base import (
+    ManagerTermBaseCfg,
+    TermFunctionSwitches,
+    TermListManager,
+    UnreadyTerm,
+)
 from mjlab.managers.nonfinite import NonFiniteWatch
-from mjlab.managers.unready_term import UnreadyTerm
+from mjlab.utils.indexing import as_index, is_empty
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.compat import offers_older_attributes
-from mjlab.managers.env_ids import as_index, is_empty
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
 from mjlab.managers.nonfinite import NonFiniteWatch
+from mjlab.utils.indexing import as_index, is_empty
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv

@@ -2,23 +2,86 @@
 
 from __future__ import annotations
 
+import copy
 import errno
 import io
+import math
 import os
 import pickle
 import re
 import tempfile
 import warnings
 import zipfile
+from collections import OrderedDict
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from mjlab.rl.learners import Learner
-from mjlab.rl.plain_data import as_plain_data
+from mjlab.rl.rsl import TensorDict
 from mjlab.utils.os import replacing
+from mjlab.utils.random import rng_state, set_rng_state
+
+if TYPE_CHECKING:
+    from mjlab.rl.rsl import VecEnv
+    from mjlab.rl.run_logger import RunLogger
+
+
+# MERGED mjlab.rl.checkpoint: Plain data: what a checkpoint may hold, because loading it runs no code.
+
+
+# Exactly these: subclasses (enums, named tuples, numpy's float64) are pickled as calls of their
+# class, which loading with `weights_only=True` refuses.
+_ATOMS = (
+    type(None), bool, int, float, complex, str, bytes,
+    torch.Tensor, torch.nn.Parameter, torch.Size, torch.dtype, torch.device,
+)  # fmt: skip
+_DICTS = (dict, OrderedDict)
+_SEQUENCES = (list, tuple, set)
+
+
+def as_plain_data(value: Any, path: str = "") -> Any:
+    """Return `value` with numpy's scalars as Python's; containers without any are returned as is.
+
+    Args:
+        value: Tensors, numbers, strings, None, and dicts, lists, tuples and sets of those.
+        path: Where in a file `value` is to be, for the message.
+
+    Raises:
+        TypeError: something else is in there; the message says where and of which type.
+    """
+    if isinstance(value, np.generic):
+        value = value.item()
+    kind = type(value)
+    if kind in _ATOMS:
+        return value
+    if kind in _DICTS:
+        return _plain_dict(value, path)
+    if kind in _SEQUENCES:
+        items = [as_plain_data(item, f"{path}[{index}]") for index, item in enumerate(value)]
+        same = all(one is other for one, other in zip(items, value, strict=True))
+        return value if same else kind(items)
+    raise TypeError(f"{path or 'it'} is a {kind.__module__}.{kind.__qualname__}")
+
+
+def _plain_dict(value: dict[Any, Any], path: str) -> dict[Any, Any]:
+    items = {}
+    same = True
+    for key, item in value.items():
+        plain_key = as_plain_data(key, f"a key of {path or 'it'}")
+        items[plain_key] = as_plain_data(item, f"{path}.{key}" if path else str(key))
+        same = same and plain_key is key and items[plain_key] is item
+    if same:
+        return value
+    # A copy and not a new dict, because state dicts of modules carry versions as an attribute.
+    plain = copy.copy(value)
+    plain.clear()
+    plain.update(items)
+    return plain
+
 
 # Only in checkpoints of SAC.
 _SAC_KEY = "sac_state_dict"
@@ -208,3 +271,360 @@ def _unpickling_message(path: Path, error: Exception) -> str:
 
 def _first_line(error: BaseException) -> str:
     return (str(error).strip() or type(error).__name__).splitlines()[0][:160]
+
+
+# MERGED mjlab.rl.checkpoint: Older layouts of a checkpoint, brought to today's; and whether one fits the networks.
+
+_STD_NAMES = {
+    "std": "distribution.std_param",
+    "log_std": "distribution.log_std_param",
+}
+
+# The entries whose type is known, whoever wrote the file: a dict, or a number of iterations.
+_DICT_ENTRIES = (
+    "model_state_dict", "actor_state_dict", "critic_state_dict", "student_state_dict",
+    "teacher_state_dict", "optimizer_state_dict", "rnd_state_dict", "rnd_optimizer_state_dict",
+    "infos", "training_state",
+)  # fmt: skip
+
+# Entries of learning, beside the networks.
+_LEARNING_ENTRIES = ("optimizer_state_dict", "rnd_optimizer_state_dict", "sac_state_dict")
+_COUNT_ENTRIES = {"iter": -1, "iterations_finished": 0, "last_evaluated": 0}
+
+
+def migrate(checkpoint: Mapping[str, Any], path: str = "") -> dict[str, Any]:
+    """Return `checkpoint`, read from `path`, in today's layout; the argument is not changed.
+
+    Two older layouts are known: one state dict for actor and critic together
+    (`model_state_dict`), and an actor whose standard deviation is called `std` or `log_std`.
+
+    Raises:
+        CheckpointError: an entry is not of the type that it must have.
+    """
+    _check_types(checkpoint, path)
+    migrated = dict(checkpoint)
+    if migrated.get("model_state_dict") is not None:
+        migrated.update(_split_single_model(migrated.pop("model_state_dict")))
+    if migrated.get("actor_state_dict") is not None:
+        migrated["actor_state_dict"] = {
+            _STD_NAMES.get(name, name): value
+            for name, value in migrated["actor_state_dict"].items()
+        }
+    return migrated
+
+
+def _check_types(checkpoint: Mapping[str, Any], path: str) -> None:
+    for name in _DICT_ENTRIES:
+        value = checkpoint.get(name)
+        # None stands for an entry that is not there: rsl_rl writes `infos` so.
+        if value is not None and not isinstance(value, dict):
+            raise _malformed(path, name, "a dict", value)
+        if value is not None and name.endswith("_state_dict"):
+            for key in value:
+                if not isinstance(key, str):
+                    raise _malformed(path, f"a key of {name}", "a string", key)
+    for name, least in _COUNT_ENTRIES.items():
+        if name in checkpoint and not _is_count(checkpoint[name], least):
+            raise _malformed(path, name, f"a whole number from {least} up", checkpoint[name])
+    owes = checkpoint.get("owes_evaluation", False)
+    if not isinstance(owes, bool):
+        raise _malformed(path, "owes_evaluation", "a bool", owes)
+    env_state = (checkpoint.get("infos") or {}).get("env_state")
+    if env_state is None:
+        return
+    if not isinstance(env_state, dict):
+        raise _malformed(path, "infos.env_state", "a dict", env_state)
+    counter = env_state.get("common_step_counter", 0)
+    if not _is_count(counter, 0):
+        name = "infos.env_state.common_step_counter"
+        raise _malformed(path, name, "a whole number from 0 up", counter)
+
+
+def _is_count(value: Any, least: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+
+def _malformed(path: str, name: str, allowed: str, value: Any) -> CheckpointError:
+    shown = repr(value)
+    shown = shown if len(shown) <= 60 else f"{shown[:57]}..."
+    return CheckpointError(
+        f"The checkpoint {path!r} is malformed: {name} must be {allowed} and is {shown} "
+        f"({type(value).__name__}). Use another checkpoint; nothing was changed."
+    )
+
+
+def _split_single_model(model: Mapping[str, torch.Tensor]) -> dict[str, Any]:
+    prefixes = {
+        "actor.": ("actor_state_dict", "mlp."),
+        "actor_obs_normalizer.": ("actor_state_dict", "obs_normalizer."),
+        "critic.": ("critic_state_dict", "mlp."),
+        "critic_obs_normalizer.": ("critic_state_dict", "obs_normalizer."),
+    }
+    split: dict[str, dict[str, torch.Tensor]] = {"actor_state_dict": {}, "critic_state_dict": {}}
+    for name, value in model.items():
+        if name in _STD_NAMES:
+            split["actor_state_dict"][name] = value
+        for prefix, (part, today) in prefixes.items():
+            if name.startswith(prefix):
+                split[part][today + name.removeprefix(prefix)] = value
+    return split
+
+
+def check_fits(
+    model: torch.nn.Module, saved: Mapping[str, Any] | None, *, name: str, path: str
+) -> None:
+    """Check that the state dict `saved` fits `model`.
+
+    Raises:
+        CheckpointError: parameters are missing, unknown, of another shape, or NaN or infinite; all are
+            listed.
+    """
+    if saved is None:
+        raise CheckpointError(
+            f"The checkpoint {path!r} holds no {name} weights; use one that the same learner wrote."
+        )
+    own = model.state_dict()
+    expected = {key: tuple(value.shape) for key, value in own.items()}
+    found = {key: tuple(value.shape) for key, value in saved.items() if hasattr(value, "shape")}
+    if expected == found:
+        # What a network is built with, such as a mask of minus infinity, may be in its checkpoint.
+        broken = [key for key in own if not _is_finite(saved[key]) and _is_finite(own[key])]
+        if broken:
+            raise CheckpointError(
+                f"The checkpoint {path!r} holds {name} weights that are NaN or infinite: "
+                f"{', '.join(broken)}. Use an earlier one; nothing was changed."
+            )
+        return
+    lines = [
+        f"  {key}: expected {expected.get(key, 'nothing')}, found {found.get(key, 'nothing')}"
+        for key in sorted(expected.keys() | found.keys())
+        if expected.get(key) != found.get(key)
+    ]
+    raise CheckpointError(
+        f"The checkpoint {path!r} is of another network: its {name} does not fit this task's "
+        f"{name} config.\n" + "\n".join(lines) + "\nUse a checkpoint of this task, or make "
+        f"the network (--agent.{name}.) and the observations what they were when it was trained."
+    )
+
+
+def _is_finite(value: torch.Tensor) -> bool:
+    return bool(torch.isfinite(value).all())
+
+
+def check_optimizer_fits(
+    optimizer: torch.optim.Optimizer, saved: Mapping[str, Any] | None, *, path: str
+) -> None:
+    """Check that the state `saved` is of as many parameters of the same shapes.
+
+    torch itself compares numbers of parameters only, and would fail at the next update.
+
+    Raises:
+        CheckpointError: it is not.
+    """
+    try:
+        fits = saved is not None and _optimizer_fits(optimizer, saved)
+    except (KeyError, TypeError, AttributeError):
+        fits = False
+    if not fits:
+        raise CheckpointError(
+            f"The checkpoint {path!r} holds no optimizer state for these networks. To use its "
+            "policy only, load it with load_cfg={'actor': True}; nothing was changed."
+        )
+
+
+def check_finite(checkpoint: Mapping[str, Any], path: str) -> None:
+    """Check the states of optimizers and of SAC.
+
+    Raises:
+        CheckpointError: tensors are NaN, or learning rates not finite.
+    """
+    broken = not_finite({name: checkpoint.get(name) for name in _LEARNING_ENTRIES})
+    if broken:
+        raise CheckpointError(
+            f"The checkpoint {path!r} holds values that are NaN or infinite: {', '.join(broken)}. "
+            "Use an earlier one; nothing was changed."
+        )
+
+
+def not_finite(value: Any, name: str = "") -> list[str]:
+    """Return the names of tensors within `value` that hold NaN, and of learning rates not finite."""
+    if isinstance(value, torch.Tensor):
+        return [name] if bool(value.isnan().any()) else []
+    if isinstance(value, float):
+        return [name] if name.endswith(".lr") and not math.isfinite(value) else []
+    if isinstance(value, dict):
+        items = value.items()
+    elif isinstance(value, (list, tuple)):
+        items = enumerate(value)
+    else:
+        return []
+    prefix = f"{name}." if name else ""
+    return [found for key, item in items for found in not_finite(item, f"{prefix}{key}")]
+
+
+def _optimizer_fits(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> bool:
+    groups = saved["param_groups"]
+    if len(groups) != len(optimizer.param_groups):
+        return False
+    for group, own in zip(groups, optimizer.param_groups, strict=True):
+        if len(group["params"]) != len(own["params"]) or not isinstance(group["lr"], float):
+            return False
+        # Switches of torch's optimizers; another release may have others.
+        switches = [name for name, value in own.items() if isinstance(value, bool)]
+        if not all(isinstance(group.get(name, False), bool) for name in switches):
+            return False
+        for number, parameter in zip(group["params"], own["params"], strict=True):
+            state = saved["state"].get(number)
+            if state is not None and not state:
+                # torch would begin with new moments, without a word.
+                return False
+            for value in (state or {}).values():
+                is_moment = isinstance(value, torch.Tensor) and value.dim() > 0
+                if is_moment and value.shape != parameter.shape:
+                    return False
+    return True
+
+
+# MERGED mjlab.rl.checkpoint: What exact resume needs beyond the networks: environments, generators, clocks.
+#
+# Everything is plain data, so that a checkpoint loads with `weights_only=True`.
+
+VERSION = 1
+
+
+def capture(
+    env: VecEnv, algorithm: Any, run_logger: RunLogger, observations: TensorDict
+) -> dict[str, Any]:
+    """Return the state between two iterations, `observations` being the ones to act on next."""
+    unwrapped: Any = getattr(env, "unwrapped", env)
+    state: dict[str, Any] = {
+        "version": VERSION,
+        "num_envs": env.num_envs,
+        "rng": rng_state(),
+        "observations": {key: value.clone() for key, value in _flat(observations).items()},
+        "logger": run_logger.state_dict(),
+        "hidden_states": [_hidden_state(model) for model in _models(algorithm)],
+        "rnd": _rnd_state(getattr(algorithm, "rnd", None)),
+    }
+    if hasattr(unwrapped, "state_dict"):
+        state["env"] = unwrapped.state_dict()
+    return state
+
+
+def restore(
+    state: dict[str, Any], env: VecEnv, algorithm: Any, run_logger: RunLogger
+) -> TensorDict:
+    """Restore what `capture` returned, and return the observations to act on next.
+
+    Raises:
+        ValueError: the state is of other environments; nothing was changed then.
+        CheckpointError: the state is malformed.
+    """
+    try:
+        return _restore(state, env, algorithm, run_logger)
+    except torch.OutOfMemoryError:
+        raise
+    except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
+        raise CheckpointError(
+            f"The checkpoint's training_state is malformed ({type(error).__name__}: {error}). Use an "
+            "earlier checkpoint, or load only its networks with load_cfg={'actor': True, 'critic': True}."
+        ) from error
+
+
+def _restore(
+    state: dict[str, Any], env: VecEnv, algorithm: Any, run_logger: RunLogger
+) -> TensorDict:
+    if state.get("version") != VERSION:
+        raise ValueError(f"It was saved in format {state.get('version')}, not {VERSION}.")
+    if state["num_envs"] != env.num_envs:
+        raise ValueError(
+            f"It is of {state['num_envs']} environments and this run has {env.num_envs}; give "
+            f"--num-envs {state['num_envs']}."
+        )
+    observations = _unflat(state["observations"], env.num_envs)
+    expected = env.get_observations()
+    if _shapes(observations) != _shapes(expected):
+        raise ValueError(
+            f"Its observations are {_shapes(observations)}, and this run's {_shapes(expected)}."
+        )
+    unwrapped: Any = getattr(env, "unwrapped", env)
+    if "env" in state and hasattr(unwrapped, "load_state_dict"):
+        # Tensors that the rollout made can only be written to in this mode.
+        with torch.inference_mode():
+            unwrapped.load_state_dict(_to(state["env"], env.device))
+    device = run_logger.device
+    run_logger.load_state_dict(state["logger"])
+    for model, hidden in zip(_models(algorithm), state["hidden_states"], strict=True):
+        if hidden is not None:
+            model.reset(hidden_state=_as_tuples(_to(hidden, device)))
+    if hasattr(algorithm, "last_hidden_states"):
+        # Of rsl_rl's distillation, which begins an update with those before the iteration.
+        algorithm.last_hidden_states = (algorithm.student.get_hidden_state(), None)
+    _restore_rnd(getattr(algorithm, "rnd", None), state["rnd"], device)
+    observations = observations.to(device)
+    # Last, because restoring may have drawn random numbers.
+    set_rng_state(state["rng"])
+    return observations
+
+
+def _models(algorithm: Any) -> list[Any]:
+    names = ("actor", "critic", "student", "teacher")
+    return [getattr(algorithm, name) for name in names if hasattr(algorithm, name)]
+
+
+def _hidden_state(model: Any) -> Any:
+    hidden = model.get_hidden_state()
+    return list(hidden) if isinstance(hidden, tuple) else hidden
+
+
+def _as_tuples(hidden: Any) -> Any:
+    return tuple(hidden) if isinstance(hidden, list) else hidden
+
+
+def _rnd_state(rnd: Any) -> dict[str, Any] | None:
+    if rnd is None:
+        return None
+    average = getattr(getattr(rnd, "reward_normalizer", None), "disc_avg", None)
+    return {
+        "update_counter": rnd.update_counter,
+        "discounted_average": None if average is None else average.avg,
+    }
+
+
+def _restore_rnd(rnd: Any, state: dict[str, Any] | None, device: Any) -> None:
+    if rnd is None or state is None:
+        return
+    rnd.update_counter = state["update_counter"]
+    average = getattr(getattr(rnd, "reward_normalizer", None), "disc_avg", None)
+    if average is not None:
+        average.avg = _to(state["discounted_average"], device)
+
+
+def _flat(observations: TensorDict) -> dict[str, torch.Tensor]:
+    """Return the tensors by name; names of nested ones are joined by a newline."""
+    return {
+        "\n".join(key) if isinstance(key, tuple) else key: observations.get(key)
+        for key in observations.keys(include_nested=True, leaves_only=True)
+    }
+
+
+def _shapes(observations: TensorDict) -> dict[str, tuple[int, ...]]:
+    return {key: tuple(value.shape) for key, value in _flat(observations).items()}
+
+
+def _unflat(tensors: dict[str, torch.Tensor], num_envs: int) -> TensorDict:
+    observations = TensorDict({}, batch_size=[num_envs])
+    for key, value in tensors.items():
+        observations.set(tuple(key.split("\n")), value)
+    return observations
+
+
+def _to(value: Any, device: Any) -> Any:
+    """Move all tensors within dicts and lists to `device`."""
+    if isinstance(value, torch.Tensor):
+        return value.to(device)
+    if isinstance(value, dict):
+        return {key: _to(item, device) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(_to(item, device) for item in value)
+    return value

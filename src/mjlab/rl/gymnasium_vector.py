@@ -14,7 +14,7 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from mjlab.envs.env_checks import as_action
+from mjlab.envs.manager_based_rl_env import as_action
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv

@@ -15,39 +15,37 @@ from typing import Any
 
 import torch
 
-from mjlab.rl import training_state
+from mjlab.rl import checkpoint as training_state
 from mjlab.rl.checkpoint import (
     CheckpointError,
     RunFolderError,
+    check_finite,
+    check_fits,
+    check_optimizer_fits,
     ensure_writable_folder,
     load_checkpoint,
+    migrate,
+    not_finite,
     save_checkpoint,
 )
 from mjlab.rl.distributed import join_processes
 from mjlab.rl.divergence import RolloutWatch
-from mjlab.rl.evaluate import reward_unit
-from mjlab.rl.evaluation_result import EvaluationResult
+from mjlab.rl.evaluation import EvaluationResult, SolvedCheck, reward_unit
 from mjlab.rl.exporter_utils import (
     DIGEST_KEY,
     attach_metadata_to_onnx,
+    export_to_onnx,
     get_base_metadata,
     initializers_digest,
 )
-from mjlab.rl.image_encoders import (
+from mjlab.rl.networks import (
+    check_mini_batches,
+    check_networks,
+    check_symmetry,
     settle_image_settings,
     shared_parameters_allowed,
     train_once,
 )
-from mjlab.rl.migration import (
-    check_finite,
-    check_fits,
-    check_optimizer_fits,
-    migrate,
-    not_finite,
-)
-from mjlab.rl.network_checks import check_mini_batches, check_networks
-from mjlab.rl.onnx_export import export_to_onnx
-from mjlab.rl.progress import IterationStats, TrainingObserver
 from mjlab.rl.replay import ReplayFiles, ReplayStorage
 from mjlab.rl.rsl import (
     PPO,
@@ -58,17 +56,15 @@ from mjlab.rl.rsl import (
     enable_torch_compile,
     keep_compiler_out_of_step,
 )
-from mjlab.rl.run_logger import RunLogger
-from mjlab.rl.solved import SolvedCheck
-from mjlab.rl.stop_request import StopRequest
-from mjlab.rl.symmetry_check import check_symmetry
-from mjlab.rl.threads import torch_threads, using_torch_threads
+from mjlab.rl.run_logger import IterationStats, RunLogger, TrainingObserver
 from mjlab.utils.processes import process_rank
 from mjlab.utils.random import seed_rng, session_seed
+from mjlab.utils.signals import StopRequest
+from mjlab.utils.torch import torch_threads, using_torch_threads
 
 logger = logging.getLogger(__name__)
-
 _RECURRENT_KEYS = ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")
+
 # What `learn` ends with, in the order in which one outweighs another between processes.
 _REASONS = ("", "solved", "interrupted")
 
@@ -781,3 +777,29 @@ def _printing_to_log() -> Generator[None]:
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         yield
     logger.debug("%s", printed.getvalue().rstrip())
+
+
+# MERGED mjlab.rl.runner: The runner of tasks whose policies are deployed.
+
+
+class ExportingOnPolicyRunner(MjlabOnPolicyRunner):
+    """Trains as `MjlabOnPolicyRunner` does, and exports the policy whenever it saves."""
+
+    exports_on_save = True
+
+    def save(self, path: str, infos=None) -> None:
+        """Write a checkpoint, and the policy where `_get_export_paths` says.
+
+        The ONNX file carries what a deployment needs to know. An export that fails is logged, and
+        training goes on.
+
+        Args:
+            path: Where to write the checkpoint.
+            infos: Further plain data, which `load` returns.
+
+        Raises:
+            CheckpointError: the checkpoint could not be written.
+        """
+        super().save(path, infos)
+        if self._writes:
+            self.export_policy(str(self._get_export_paths(path)[2]))

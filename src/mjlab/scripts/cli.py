@@ -27,7 +27,7 @@ _OTHER_PROCESS = ("mjlab.rl.distributed", "OtherProcessError")
 _LAZY_ERRORS = (
     ("mjlab.sim.engine", "EngineUnavailableError"),
     ("mjlab.rl.checkpoint", "CheckpointError"),
-    ("mjlab.viewer.errors", "RenderingUnavailableError"),
+    ("mjlab.viewer.offscreen_renderer", "RenderingUnavailableError"),
     _OTHER_PROCESS,
 )
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjlab.scripts.cli import UserError, tell
-from mjlab.tasks.tracking.motion_csv import read_csv
 from mjlab.tasks.tracking.motion_file import Motion, npz_path, read_motion, write_motion
-from mjlab.tasks.tracking.motion_kinematics import (
+from mjlab.tasks.tracking.motion_recording import (
     Recording,
     make_motion,
+    read_csv,
     recording_of,
     resampled,
 )
@@ -163,8 +163,8 @@ def record_motion(motion: Motion, robot: Entity, path: Path) -> None:
     """Write a video of the motion."""
     import mujoco
 
-    from mjlab.viewer.clip_writer import ClipWriter
-    from mjlab.viewer.gl_context import open_renderer
+    from mjlab.utils.wrappers.video_recorder import ClipWriter
+    from mjlab.viewer.offscreen_renderer import open_renderer
 
     model = _stage(robot)
     data, camera, option = mujoco.MjData(model), mujoco.MjvCamera(), mujoco.MjvOption()

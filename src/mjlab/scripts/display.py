@@ -16,10 +16,10 @@ from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
-from mjlab.rl.progress import IterationStats, TrainingObserver
+from mjlab.rl.run_logger import IterationStats, TrainingObserver
 
 if TYPE_CHECKING:
-    from mjlab.rl.evaluation_result import EvaluationResult
+    from mjlab.rl.evaluation import EvaluationResult
 
 # Plain lines are for log files: often enough to follow, rarely enough to read.
 _SECONDS_BETWEEN_LINES = 5.0

@@ -43,8 +43,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     one for each episode, unless `cfg.env` has another number of them than the task, or
     `keep_num_envs` says that its number was chosen.
     """
-    from mjlab.rl.evaluate import evaluate_policy
-    from mjlab.rl.success import required_return, success_definition
+    from mjlab.rl.evaluation import evaluate_policy, required_return, success_definition
 
     if cfg.num_episodes < 1:
         raise UserError(f"--num-episodes is {cfg.num_episodes}; at least 1 has to be played.")

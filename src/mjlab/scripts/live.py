@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjlab.rl.progress import IterationStats, TrainingObserver
+from mjlab.rl.run_logger import IterationStats, TrainingObserver
 from mjlab.scripts.cli import UserError
 from mjlab.utils.os import create_locked, remove_abandoned
 

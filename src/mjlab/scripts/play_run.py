@@ -79,7 +79,7 @@ def run_play(task: str, cfg: PlayConfig) -> None:
     if cfg.video:
         _record(task, cfg, env_cfg, checkpoint, device)
         return
-    from mjlab.rl.threads import threads_for_policy
+    from mjlab.utils.torch import threads_for_policy
 
     env = make_env(task, env_cfg, device, cfg.num_envs, cfg.engine, profile=cfg.profile)
     print(f"Physics:    {env.unwrapped.sim.capabilities.description}")
@@ -96,7 +96,7 @@ def run_play(task: str, cfg: PlayConfig) -> None:
 
 
 def _play_headless(env: Any, policy: Any, num_steps: int) -> None:
-    from mjlab.viewer.headless import run_headless
+    from mjlab.viewer.base import run_headless
 
     result = run_headless(env, policy, num_steps)
     print(
@@ -113,7 +113,7 @@ def _make_viewer(
 
         return NativeMujocoViewer(env, policy)
     from mjlab.viewer import ViserPlayViewer
-    from mjlab.viewer.viser.checkpoints import local_checkpoints
+    from mjlab.viewer.viser.viewer import local_checkpoints
 
     manager = None
     if checkpoint is not None and any(checkpoint.parent.glob("*.pt")):

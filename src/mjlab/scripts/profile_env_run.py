@@ -50,7 +50,7 @@ def run_profile_env(task: str, cfg: ProfileConfig) -> dict[str, Any]:
     import torch
 
     from mjlab.envs.profiling import profiled_steps
-    from mjlab.rl.threads import threads_for_policy
+    from mjlab.utils.torch import threads_for_policy
 
     for name, least in (("num_envs", 1), ("steps", 1), ("warm_up", 0)):
         if (value := getattr(cfg, name)) < least:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from mjlab.scripts.policy import make_env, make_policy
-from mjlab.viewer.protocols import ended, forget
+from mjlab.viewer.base import ended, forget
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -53,7 +53,7 @@ def record_policy(
     """
     import torch
 
-    from mjlab.viewer.clip_writer import ClipWriter
+    from mjlab.utils.wrappers.video_recorder import ClipWriter
 
     video = video or VideoCfg()
 

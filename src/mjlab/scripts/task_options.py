@@ -1,4 +1,4 @@
-"""Flags that a task brings itself: see `mjlab.tasks.options`."""
+"""Flags that a task brings itself: see `mjlab.tasks.registry`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from mjlab.tasks.options import PolicyOrigin, TaskOptions
-from mjlab.tasks.registry import load_options_cls
+from mjlab.tasks.registry import PolicyOrigin, TaskOptions, load_options_cls
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg

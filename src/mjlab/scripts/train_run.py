@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import RslRlBaseRunnerCfg
 from mjlab.rl.learners import Learner, learner_of
-from mjlab.rl.progress import TrainingObserver
+from mjlab.rl.run_logger import TrainingObserver
 from mjlab.scripts.policy import prepare_teacher
 from mjlab.scripts.process_output import ProcessOutput, log_file, output_of
 from mjlab.scripts.profiles import parse_with_choices, suggest_profile, tell_foreign_learner
@@ -399,7 +399,7 @@ def _leave_results(task: str, cfg: TrainConfig, run_dir: Path, device: str) -> N
     if cfg.result_video and checkpoint is not None:
         from mjlab.scripts.policy import policy_env_cfg
         from mjlab.scripts.record import VideoCfg, record_policy
-        from mjlab.viewer.errors import RenderingUnavailableError
+        from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
 
         env_cfg = policy_env_cfg(task, cfg.profile, purpose="play")
         prepare_env_cfg(task, None, env_cfg, checkpoint)

@@ -2,21 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import mujoco
 import torch
 
-from mjlab.sensor._scene_names import find_in_scene
 from mjlab.sensor.sensor import Sensor, SensorCfg
 from mjlab.utils.string import name_list
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
 
-ObjType = Literal["body", "xbody", "joint", "geom", "site", "actuator", "tendon", "camera"]
 
+# MERGED mjlab.sensor.builtin_sensor: Names in the scene of what an `ObjRef` refers to.
+
+
+# The scene attaches its terrain without a prefix.
+_TERRAIN = "terrain"
+
+
+def find_in_scene(ref: ObjRef, names: Iterable[str]) -> tuple[str | None, list[str]]:
+    """Look for what `ref` refers to among the `names` that elements of its kind have in the scene.
+
+    Returns its name in the scene, None if there is no such element; and the names that the owner
+    has to offer, without its prefix.
+    """
+    prefix = f"{ref.entity}/" if ref.entity else ""
+    offered = {name.removeprefix(prefix): name for name in names if name.startswith(prefix)}
+    if ref.entity == _TERRAIN:
+        # A name with a prefix belongs to another entity. Where there is no terrain, an entity may
+        # be called so, and has its prefix.
+        offered = {name: name for name in names if name and "/" not in name} | offered
+    offered.pop("", None)
+    return offered.get(ref.name), list(offered)
+
+
+ObjType = Literal["body", "xbody", "joint", "geom", "site", "actuator", "tendon", "camera"]
 SensorType = Literal[
     "accelerometer", "velocimeter", "gyro", "force", "torque", "magnetometer", "rangefinder",
     "framepos", "framequat", "framexaxis", "frameyaxis", "framezaxis", "framelinvel",
@@ -28,7 +51,6 @@ SensorType = Literal[
     "jointactfrc", "tendonactfrc", "actuatorpos", "actuatorvel", "actuatorfrc",
     "clock", "e_potential", "e_kinetic",
 ]  # fmt: skip
-
 _FRAME = ("body", "xbody", "geom", "site", "camera")
 
 # Kinds that MJCF and MuJoCo's headers name differently; both names are taken.

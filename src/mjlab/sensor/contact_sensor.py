@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+import logging
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -9,27 +12,370 @@ import mujoco
 import torch
 
 from mjlab.compat import offers_older_attributes
-from mjlab.sensor._contact_clocks import ContactClocks
-from mjlab.sensor._contact_debug import draw_contacts
-from mjlab.sensor._contact_history import ContactHistory
-from mjlab.sensor._contact_layout import FIELD_SIZES, ContactLayout, to_world
-from mjlab.sensor._contact_names import Matched, find_matches
 from mjlab.sensor.sensor import Sensor, SensorCfg
+from mjlab.utils.state import stateful
+from mjlab.utils.string import compile_pattern, name_list
 
 if TYPE_CHECKING:
+    import mujoco
+    import torch
+
     from mjlab.entity import Entity
     from mjlab.viewer.debug_visualizer import DebugVisualizer
+
+
+# MERGED mjlab.sensor.contact_sensor: How long something has been touching, or not: the clocks of feet.
+
+
+@stateful
+class ContactClocks:
+    """Durations of the running and of the last completed phases, of contact and of air.
+
+    Time is kept in double precision, because single precision rounds every increment: the clock of
+    a foot that has stood for an hour would be off by seconds, and at the end of a day it stands
+    still.
+    """
+
+    _transient = {"_running", "_last", "_idle", "_ended", "_contact_is_idle", "_zero"}
+
+    def __init__(self, num_envs: int, num_things: int, device: str) -> None:
+        """Start `num_things` things in each environment in no phase: all durations are zero."""
+        shape = (num_envs, num_things)
+        self._times = torch.zeros(4, *shape, dtype=torch.float64, device=device)
+        self._running, self._last = self._times[:2], self._times[2:]
+        # Scratch: which of air and contact does not run now, and which of them has just ended.
+        self._idle = torch.zeros(2, *shape, dtype=torch.bool, device=device)
+        self._ended = torch.zeros(2, *shape, dtype=torch.bool, device=device)
+        # Air is idle in contact (True), contact is idle in the air (False).
+        self._contact_is_idle = torch.tensor([False, True], device=device).view(2, 1, 1)
+        self._zero = torch.zeros((), dtype=torch.float64, device=device)
+
+    def update(self, in_contact: torch.Tensor, dt: float) -> None:
+        """Advance by a substep of `dt` seconds, after which `in_contact` (N, P) bool are touching.
+
+        The substep in which a phase ends counts as part of it, and as the first one of the next: n
+        substeps in the air are reported as (n + 1) dt.
+        """
+        torch.ne(in_contact, self._contact_is_idle, out=self._idle)
+        torch.gt(self._running, 0.0, out=self._ended)
+        self._ended.logical_and_(self._idle)
+        self._running.add_(dt)
+        torch.where(self._ended, self._running, self._last, out=self._last)
+        # Faster than `masked_fill_`.
+        torch.where(self._idle, self._zero, self._running, out=self._running)
+
+    def reset(self, rows: torch.Tensor | slice) -> None:
+        """Set all durations of some environments to zero."""
+        self._times[:, rows] = 0.0
+
+    @property
+    def air(self) -> torch.Tensor:
+        """(N, P) float64 duration of the running phase of air, s; 0 in contact."""
+        return self._times[0]
+
+    @property
+    def contact(self) -> torch.Tensor:
+        """(N, P) float64 duration of the running phase of contact, s; 0 in the air."""
+        return self._times[1]
+
+    def in_single_precision(self) -> tuple[torch.Tensor, ...]:
+        """Return running air, running contact, last air, last contact, each (N, P) float32, s."""
+        return self._times.float().unbind()
+
+
+# MERGED mjlab.sensor.contact_sensor: Where in `sensordata` a contact sensor's values are, and in which frame.
+
+FIELD_SIZES = {
+    "found": 1,
+    "force": 3,
+    "torque": 3,
+    "dist": 1,
+    "pos": 3,
+    "normal": 3,
+    "tangent": 3,
+}
+"""Values of each field in one slot, in MuJoCo's order of the fields."""
+
+
+class ContactLayout:
+    """One block of `sensordata`: primary by primary, in each slot by slot, in each field by field."""
+
+    def __init__(self, fields: Iterable[str], num_primaries: int, num_slots: int) -> None:
+        wanted = set(fields)
+        self.num_primaries = num_primaries
+        self.num_slots = num_slots
+        self.start = 0
+        """Column of `sensordata` at which the block begins."""
+        self._columns: dict[str, tuple[int, int]] = {}
+        column = 0
+        for name, size in FIELD_SIZES.items():
+            if name in wanted:
+                self._columns[name] = (column, size)
+                column += size
+        self._width_of_slot = column
+        self.width = num_primaries * num_slots * column
+        """Number of columns."""
+
+    @property
+    def field_bits(self) -> int:
+        """The fields as MuJoCo's contact sensor takes them: one bit each."""
+        return sum(1 << bit for bit, name in enumerate(FIELD_SIZES) if name in self._columns)
+
+    def split(self, block: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return views of the fields of a block (..., width): (..., P S) or (..., P S, 3) each."""
+        slots = block.unflatten(-1, (self.num_primaries * self.num_slots, self._width_of_slot))
+        return {
+            name: slots.select(-1, column) if size == 1 else slots.narrow(-1, column, size)
+            for name, (column, size) in self._columns.items()
+        }
+
+    def found_first(self, block: torch.Tensor) -> torch.Tensor:
+        """Return the view (..., P) of `found` in the first slot of each primary.
+
+        Contacts fill the slots in order, so it tells whether there is any.
+        """
+        column, _ = self._columns["found"]
+        return block[..., column :: self.num_slots * self._width_of_slot]
+
+
+def to_world(vector: torch.Tensor, normal: torch.Tensor, tangent: torch.Tensor) -> torch.Tensor:
+    """Rotate (..., 3) from a contact frame, given by its first two axes, into the world frame.
+
+    F_w = [n t n x t] F_c. Empty slots are zero before and after.
+    """
+    x, y, z = vector.unsqueeze(-1).unbind(-2)
+    return x * normal + y * tangent + z * torch.linalg.cross(normal, tangent)
+
+
+# MERGED mjlab.sensor.contact_sensor: Drawing of contacts: a ball at each point, an arrow along each force.
+
+_POINT_COLOR = (0.9, 0.7, 0.1, 1.0)
+_FORCE_COLOR = (0.9, 0.2, 0.2, 0.9)
+
+# Size of the balls and of the arrow shafts, in units of the model's mean body size.
+_POINT_RADIUS = 0.1
+_ARROW_WIDTH = 0.05
+
+# Length of a force arrow: 5 mm for each newton, as for the arrows of external forces.
+_METRES_PER_NEWTON = 0.005
+
+
+def draw_contacts(
+    visualizer: DebugVisualizer, fields: dict[str, torch.Tensor], cfg: ContactSensorCfg
+) -> None:
+    """Draw the contacts of a sensor in the environments in view.
+
+    Arrows show the force that acts on the primary, which is the opposite of what is sensed.
+
+    Args:
+        visualizer: What to draw on.
+        fields: found (N, C), force, pos, normal, tangent (N, C, 3), as MuJoCo senses them.
+        cfg: Config of the sensor.
+    """
+    force = fields["force"]
+    if cfg.reduce != "netforce":
+        force = to_world(force, fields["normal"], fields["tangent"])
+    for env in visualizer.get_env_indices(force.shape[0]):
+        found = fields["found"][env].cpu()
+        points = fields["pos"][env].double().cpu().numpy()
+        forces = force[env].double().cpu().numpy()
+        for column in found.nonzero().flatten().tolist():
+            start = points[column]
+            label = f"{cfg.name}_{column}"
+            radius = _POINT_RADIUS * visualizer.meansize
+            visualizer.add_sphere(start, radius, _POINT_COLOR, label)
+            end = start - _METRES_PER_NEWTON * forces[column]
+            width = _ARROW_WIDTH * visualizer.meansize
+            visualizer.add_arrow(start, end, _FORCE_COLOR, width, label)
+
+
+# MERGED mjlab.sensor.contact_sensor: What a contact sensor measured at the last few physics substeps.
+
+
+@stateful
+class ContactHistory:
+    """A ring of raw blocks of sensor data, zero before anything was recorded.
+
+    Blocks are kept as they come, and are taken apart only when somebody reads them: recording has
+    to be cheap, because it happens at every substep.
+    """
+
+    _transient = {"_slots", "_orders"}
+
+    def __init__(self, length: int, num_envs: int, width: int, device: str) -> None:
+        """Make room for `length` blocks of shape (num_envs, width)."""
+        # `_head` is the newest block; older ones follow it cyclically.
+        self._ring = torch.zeros(length, num_envs, width, dtype=torch.float32, device=device)
+        self._head = 0
+        self._slots = list(self._ring.unbind())
+        slots = torch.arange(length, device=device)
+        self._orders = [slots.roll(-head) for head in range(length)]
+
+    def record(self, block: torch.Tensor) -> None:
+        """Add a block (N, width), in the place of the oldest one."""
+        self._head = (self._head - 1) % len(self._slots)
+        self._slots[self._head].copy_(block)
+
+    def newest_first(self) -> torch.Tensor:
+        """Return a copy of the blocks, (length, N, width)."""
+        return self._ring.index_select(0, self._orders[self._head])
+
+    def reset(self, rows: torch.Tensor | slice) -> None:
+        """Set all blocks of some environments to zero."""
+        self._ring[:, rows] = 0.0
+
+
+# MERGED mjlab.sensor.contact_sensor: Which geoms, bodies or subtrees of the scene a `ContactMatch` means.
+
+logger = logging.getLogger(__name__)
+_KINDS = {"geom": "geoms", "body": "bodies", "subtree": "bodies"}
+
+# An entry of `exclude` with one of these characters is a regular expression.
+_REGEX_CHARACTERS = frozenset(r".*+?[]{}()\|^$")
+
+
+@dataclass(frozen=True)
+class Matched:
+    """An element of the scene."""
+
+    full_name: str
+    """Name in the scene."""
+    name: str
+    """Name in its entity; `full_name` where no entity was given."""
+
+    def known_as(self) -> tuple[str, str]:
+        """The names that a pattern may match: in the entity, and in the part it belongs to."""
+        return self.name, self.name.rsplit("/", 1)[-1]
+
+
+def find_matches(
+    sensor: str,
+    role: str,
+    match: ContactMatch,
+    scene_spec: mujoco.MjSpec,
+    entities: dict[str, Entity],
+) -> list[Matched]:
+    """Return what `match`, the `role` (primary or secondary) of a sensor, means; never nothing.
+
+    Elements of an entity come in the order of the spec, names of the scene in the order given.
+
+    Raises:
+        ValueError: no such entity; no pattern, or an empty one; a pattern that matches nothing
+            (with names that are close); a name that two patterns match; everything excluded.
+    """
+    where = f"Contact sensor {sensor!r}: {role}"
+    if not match.patterns or "" in match.patterns:
+        raise ValueError(f"{where} pattern: expected at least one name, got {match.pattern!r}.")
+    if not match.entity:
+        return _find_literal(where, match, scene_spec)
+    if match.entity not in entities:
+        raise ValueError(
+            f"{where} refers to the entity {match.entity!r}. The scene has: {sorted(entities)}."
+            f"{_close_names(match.entity, entities)}"
+        )
+    prefix = f"{match.entity}/"
+    elements = _elements(entities[match.entity].spec, match.mode)
+    candidates = [Matched(e.name, e.name.removeprefix(prefix)) for e in elements if e.name]
+    found = _matched_by_patterns(where, match, candidates)
+    _warn_about_unnamed(where, match, elements)
+    kept = [one for one in found if not _is_excluded(one, match.exclude)]
+    if not kept:
+        raise ValueError(
+            f"{where}: exclude={match.exclude!r} leaves nothing of what {match.pattern!r} matches: "
+            f"{name_list([one.name for one in found], near=())}."
+        )
+    return kept
+
+
+def _elements(spec: mujoco.MjSpec, mode: str) -> list[Any]:
+    # The first body of a spec is the world, which is nobody's.
+    return list(spec.geoms) if mode == "geom" else list(spec.bodies[1:])
+
+
+def _find_literal(where: str, match: ContactMatch, scene_spec: mujoco.MjSpec) -> list[Matched]:
+    elements = scene_spec.geoms if match.mode == "geom" else scene_spec.bodies
+    names = [element.name for element in elements if element.name]
+    for name in match.patterns:
+        if name not in names:
+            raise ValueError(
+                f"{where} names the {match.mode} {name!r}, which the scene does not have. Without "
+                f"ContactMatch.entity, a name is taken literally.{_close_names(name, names)} "
+                f"It has: {name_list(names, near=())}."
+            )
+    if len(set(match.patterns)) != len(match.patterns):
+        raise ValueError(f"{where} names an element twice: {match.pattern!r}.")
+    if match.exclude:
+        logger.warning("%s: exclude has no effect without ContactMatch.entity.", where)
+    return [Matched(name, name) for name in match.patterns]
+
+
+def _matched_by_patterns(
+    where: str, match: ContactMatch, candidates: Sequence[Matched]
+) -> list[Matched]:
+    owners: dict[Matched, str] = {}
+    for pattern in match.patterns:
+        matching = _matching(pattern, candidates)
+        if not matching:
+            names = [candidate.name for candidate in candidates]
+            raise ValueError(
+                f"{where} pattern {pattern!r} matches none of the {_KINDS[match.mode]} of entity "
+                f"{match.entity!r}. A pattern must match a whole name."
+                f"{_close_names(pattern, names)} It has: {name_list(names, near=())}."
+            )
+        for candidate in matching:
+            if candidate in owners:
+                raise ValueError(
+                    f"{where}: {candidate.name!r} is matched by both {owners[candidate]!r} and "
+                    f"{pattern!r}. Each name may be matched by one pattern only."
+                )
+            owners[candidate] = pattern
+    return [candidate for candidate in candidates if candidate in owners]
+
+
+def _matching(pattern: str, candidates: Sequence[Matched]) -> list[Matched]:
+    # A name that is meant literally may contain what a regular expression reads otherwise.
+    exact = [candidate for candidate in candidates if candidate.name == pattern]
+    if exact:
+        return exact
+    regex = compile_pattern(pattern)
+    return [c for c in candidates if any(regex.fullmatch(name) for name in c.known_as())]
+
+
+def _is_excluded(candidate: Matched, exclude: Iterable[str]) -> bool:
+    return any(
+        compile_pattern(entry).search(candidate.name) is not None
+        if _REGEX_CHARACTERS.intersection(entry)
+        else entry in candidate.known_as()
+        for entry in exclude
+    )
+
+
+def _warn_about_unnamed(where: str, match: ContactMatch, elements: Sequence[Any]) -> None:
+    """Say which elements a pattern that matches everything cannot reach."""
+    unnamed = sum(1 for element in elements if not element.name)
+    if unnamed and any(compile_pattern(p).fullmatch("") for p in match.patterns):
+        logger.warning(
+            "%s: %d %s of entity %r have no name, so their contacts are not sensed. Name them, or "
+            "use mode 'body'.",
+            where, unnamed, _KINDS[match.mode], match.entity,
+        )  # fmt: skip
+
+
+def _close_names(name: str, names: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, list(names), n=3)
+    return f" Close names: {', '.join(close)}." if close else ""
+
 
 MatchMode = Literal["geom", "body", "subtree"]
 Reduction = Literal["none", "mindist", "maxforce", "netforce"]
 SecondaryPolicy = Literal["first", "any", "error"]
-
 _OBJECT_TYPES = {
     "geom": mujoco.mjtObj.mjOBJ_GEOM,
     "body": mujoco.mjtObj.mjOBJ_BODY,
     "subtree": mujoco.mjtObj.mjOBJ_XBODY,
 }
 _HISTORY_FIELDS = ("force", "torque", "dist")
+
 # What drawing needs, whether or not the user asked for it.
 _DEBUG_FIELDS = ("found", "force", "pos", "normal", "tangent")
 

@@ -2,32 +2,302 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
 import mujoco
 import torch
 
 from mjlab.compat import older_names
-from mjlab.sensor._frames import Frames, check_frames
-from mjlab.sensor._ray_alignment import RayAlignment, is_constant, rotate_into
-from mjlab.sensor._ray_data import RayCastData
-from mjlab.sensor._ray_debug import VizCfg, draw_rays
-from mjlab.sensor._ray_patterns import (
+from mjlab.sensor.builtin_sensor import ObjRef, find_in_scene
+from mjlab.sensor.ray_patterns import (
     GridPatternCfg,
     PatternCfg,
     PinholeCameraPatternCfg,
     RingPatternCfg,
 )
-from mjlab.sensor.builtin_sensor import ObjRef
 from mjlab.sensor.sensor import Sensor, SensorCfg
+from mjlab.utils.lab_api.math import quat_from_matrix
+from mjlab.utils.string import name_list
 
 if TYPE_CHECKING:
+    import torch
+
     from mjlab.entity import Entity
     from mjlab.sensor.sensor_context import SensorContext
     from mjlab.viewer.debug_visualizer import DebugVisualizer
+
+
+# MERGED mjlab.sensor.raycast_sensor: Frames of the scene that a sensor is attached to: bodies, sites and geoms.
+
+
+# Kind of frame: fields of MjData with position and orientation, and MuJoCo's type of the object.
+_KINDS = {
+    "body": ("xpos", "xmat", mujoco.mjtObj.mjOBJ_BODY),
+    "site": ("site_xpos", "site_xmat", mujoco.mjtObj.mjOBJ_SITE),
+    "geom": ("geom_xpos", "geom_xmat", mujoco.mjtObj.mjOBJ_GEOM),
+}
+
+
+def check_frames(frames: tuple[ObjRef, ...], entities: dict[str, Entity]) -> None:
+    """Raise ValueError unless all `frames` are bodies, sites or geoms, of entities there are."""
+    if not frames:
+        raise ValueError("frame is empty; give one ObjRef or several.")
+    for frame in frames:
+        if frame.type not in _KINDS:
+            raise ValueError(
+                f"frame {frame.name!r} is of type {frame.type!r}; rays start at a body, a site or "
+                "a geom."
+            )
+        if frame.entity and frame.entity not in entities:
+            raise ValueError(
+                f"frame {frame.name!r} refers to the entity {frame.entity!r}. The scene has: "
+                f"{sorted(entities)}."
+            )
+
+
+def _find(frame: ObjRef, mj_model: mujoco.MjModel) -> int:
+    """Return the id of a frame; ValueError with close names if there is none."""
+    kind = _KINDS[frame.type][2]
+    names = [
+        mujoco.mj_id2name(mj_model, kind, i) or ""
+        for i in range(getattr(mj_model, f"n{frame.type}"))
+    ]
+    full_name, offered = find_in_scene(frame, names)
+    if full_name is not None:
+        return names.index(full_name)
+    close = difflib.get_close_matches(frame.name, offered, n=3)
+    hint = f"Close names: {', '.join(close)}." if close else f"It has: {name_list(offered, [])}."
+    owner = f"Entity {frame.entity!r}" if frame.entity else "The scene"
+    raise ValueError(f"{owner} has no {frame.type} {frame.name!r}. {hint}")
+
+
+class Frames:
+    """Poses of several frames, in the order in which they were given."""
+
+    def __init__(
+        self, frames: tuple[ObjRef, ...], mj_model: mujoco.MjModel, data: Any, device: str
+    ) -> None:
+        """Find the frames; ValueError with close names for one that does not exist."""
+        self._data = data
+        self._parts: list[tuple[str, str, torch.Tensor, torch.Tensor]] = []
+        self.body_ids: list[int] = []
+        """The body that carries each frame."""
+        ids = []
+        for frame in frames:
+            index = _find(frame, mj_model)
+            ids.append(index)
+            owners = {"site": mj_model.site_bodyid, "geom": mj_model.geom_bodyid}
+            self.body_ids.append(index if frame.type == "body" else int(owners[frame.type][index]))
+        for kind in dict.fromkeys(frame.type for frame in frames):
+            places = [i for i, frame in enumerate(frames) if frame.type == kind]
+            self._parts.append(
+                (
+                    *_KINDS[kind][:2],
+                    torch.tensor(places, device=device),
+                    torch.tensor([ids[i] for i in places], device=device),
+                )
+            )
+
+    def read(self, pos: torch.Tensor, mat: torch.Tensor) -> None:
+        """Copy current positions into `pos` (N, F, 3) and orientations into `mat` (N, F, 3, 3)."""
+        for pos_field, mat_field, places, ids in self._parts:
+            for out, source in ((pos, pos_field), (mat, mat_field)):
+                values = getattr(self._data, source).index_select(1, ids)
+                if len(self._parts) == 1:
+                    out.copy_(values)
+                else:
+                    out.index_copy_(1, places, values)
+
+
+# MERGED mjlab.sensor.raycast_sensor: Rotating the rays of a frame into the world.
+
+RayAlignment = Literal["base", "yaw", "world"]
+"""How rays turn with their frame: fully, about the vertical only, or not at all."""
+
+# Below this horizontal length of the frame's x axis, its y axis says where the frame points.
+_STEEP = 0.1
+_TINY = 1e-12
+
+
+def heading(mat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return cosine and sine of the yaw (...,) of rotation matrices (..., 3, 3).
+
+    The direction is that of the horizontal projection of the frame's x axis. Where the x axis is
+    nearly vertical (projection shorter than 0.1), it is the projection (a, b) of the y axis turned
+    back by a quarter: (b, -a).
+    """
+    # By components: an operation over a last dimension of two takes a CPU ten times as long.
+    x, y = mat[..., 0, 0], mat[..., 1, 0]
+    is_steep = x * x + y * y < _STEEP**2
+    x = torch.where(is_steep, mat[..., 1, 1], x)
+    y = torch.where(is_steep, -mat[..., 0, 1], y)
+    length = (x * x + y * y).sqrt_().clamp_(min=_TINY)
+    return x / length, y / length
+
+
+def is_constant(vectors: torch.Tensor, alignment: RayAlignment) -> bool:
+    """Return whether vectors (n, 3) of the aligned frame point the same way in every pose."""
+    if alignment == "world":
+        return True
+    return alignment == "yaw" and bool((vectors[:, :2] == 0.0).all())
+
+
+def rotate_into(
+    out: torch.Tensor,
+    vectors: torch.Tensor,
+    mat: torch.Tensor,
+    alignment: RayAlignment,
+    start: torch.Tensor | None = None,
+) -> None:
+    """Write `start + A vectors` into `out`, with A the aligned orientation of each frame.
+
+    Column by column, because every column is one operation over all environments and rays, and
+    without a matrix product, which a GPU may round to TF32: centimetres, far from the origin.
+
+    Args:
+        out: (N, F, n, 3).
+        vectors: (n, 3) in the aligned frame.
+        mat: (N, F, 3, 3) orientations of the frames.
+        alignment: Which part of the orientation counts.
+        start: (N, F, 3) world positions; None for none.
+    """
+    x, y, z = vectors.unbind(-1)
+    if alignment == "yaw":
+        cosine, sine = (part[..., None] for part in heading(mat))
+        turn = (cosine, -sine), (sine, cosine)
+    else:
+        turn = ()
+    for axis, column in enumerate(out.unbind(-1)):
+        if alignment == "base":
+            first, second, third = mat[..., axis, :, None].unbind(-2)
+            part = (first * x).addcmul_(second, y).addcmul_(third, z)
+        elif alignment == "world" or axis == 2:
+            part = vectors[:, axis].expand_as(column)
+        else:
+            first, second = turn[axis]
+            part = (first * x).addcmul_(second, y)
+        # The start comes last: far from the origin, sums with it are rounded most.
+        torch.add(part, 0.0 if start is None else start[..., axis, None], out=column)
+
+
+# MERGED mjlab.sensor.raycast_sensor: What a ray sensor has measured.
+
+
+@dataclass
+class RayCastData:
+    """What a ray sensor with F frames of n rays has measured; ray `f n + r` is ray r of frame f."""
+
+    distances: torch.Tensor
+    """(N, F n) metres; -1 for a miss."""
+    normals_w: torch.Tensor
+    """(N, F n, 3) unit surface normals in the world frame; 0 for a miss."""
+    hit_pos_w: torch.Tensor
+    """(N, F n, 3) world positions of what is hit; for a miss, where the ray starts."""
+    pos_w: torch.Tensor
+    """(N, 3) world position of the first frame."""
+    quat_w: torch.Tensor
+    """(N, 4) orientation of the first frame, not aligned."""
+    frame_pos_w: torch.Tensor
+    """(N, F, 3) world positions of the frames."""
+    frame_quat_w: torch.Tensor
+    """(N, F, 4) orientations of the frames, not aligned."""
+
+    @classmethod
+    def with_frames(cls, frame_mat: torch.Tensor, **fields: torch.Tensor) -> Self:
+        """Return data whose quaternions are computed from `frame_mat` (N, F, 3, 3) when read.
+
+        Few terms read them, and computing them takes longer than all the other fields together.
+        """
+        data = cls.__new__(cls)
+        data.__dict__.update(fields, _frame_mat=frame_mat)
+        return data
+
+    def __getattr__(self, name: str) -> Any:
+        # Only asked for what is not there yet.
+        if name not in ("quat_w", "frame_quat_w") or "_frame_mat" not in self.__dict__:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        self.frame_quat_w = quat_from_matrix(self.__dict__["_frame_mat"])
+        self.quat_w = self.frame_quat_w[:, 0]
+        return self.__dict__[name]
+
+
+# MERGED mjlab.sensor.raycast_sensor: Drawing what a ray sensor sees.
+
+Color = tuple[float, float, float, float]
+_RAY_WIDTH = 0.1
+
+
+@dataclass
+class VizCfg:
+    """How rays are drawn. Lengths are multiples of the model's mean size, colours RGBA."""
+
+    hit_color: Color = (0.0, 1.0, 0.0, 0.8)
+    """Colour of rays that hit something."""
+    miss_color: Color = (1.0, 0.0, 0.0, 0.4)
+    """Colour of rays that hit nothing."""
+    hit_sphere_color: Color = (0.0, 1.0, 1.0, 1.0)
+    """Colour of the spheres at the points that are hit."""
+    hit_sphere_radius: float = 0.5
+    """Radius of these spheres."""
+    show_rays: bool = False
+    """Whether to draw the rays as arrows."""
+    show_normals: bool = False
+    """Whether to draw surface normals at the points that are hit."""
+    normal_color: Color = (1.0, 1.0, 0.0, 1.0)
+    """Colour of the normals."""
+    normal_length: float = 5.0
+    """Length of the normals."""
+
+
+def draw_rays(
+    visualizer: DebugVisualizer,
+    name: str,
+    viz: VizCfg,
+    max_distance: float,
+    rays: dict[str, torch.Tensor],
+) -> None:
+    """Draw the rays of the environments in view.
+
+    Args:
+        visualizer: What to draw into.
+        name: Name of the sensor, for the labels.
+        viz: Colours and sizes.
+        max_distance: Reach of the rays (m); a miss is drawn `min(0.5, 0.05 max_distance)` long.
+        rays: `origins`, `directions`, `hits`, `normals` (N, R, 3) and `distances` (N, R).
+    """
+    size = visualizer.meansize
+    miss_length = min(0.5, 0.05 * max_distance)
+    for env in visualizer.get_env_indices(rays["distances"].shape[0]):
+        origins, directions, hits, normals, distances = (
+            rays[key][env].detach().cpu().double().numpy()
+            for key in ("origins", "directions", "hits", "normals", "distances")
+        )
+        for i, distance in enumerate(distances):
+            hit = distance >= 0.0
+            end = hits[i] if hit else origins[i] + miss_length * directions[i]
+            if viz.show_rays:
+                color = viz.hit_color if hit else viz.miss_color
+                visualizer.add_arrow(
+                    origins[i], end, color, width=_RAY_WIDTH * size, label=f"{name}_ray_{i}"
+                )
+            if not hit:
+                continue
+            visualizer.add_sphere(
+                end, viz.hit_sphere_radius * size, viz.hit_sphere_color, label=f"{name}_hit_{i}"
+            )
+            if viz.show_normals:
+                visualizer.add_arrow(
+                    end,
+                    end + viz.normal_length * size * normals[i],
+                    viz.normal_color,
+                    width=_RAY_WIDTH * size,
+                    label=f"{name}_normal_{i}",
+                )
+
 
 __all__ = [
     "GridPatternCfg",
@@ -39,7 +309,6 @@ __all__ = [
     "RayCastSensorCfg",
     "RingPatternCfg",
 ]
-
 NUM_GEOM_GROUPS = 6
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import torch
 
-from mjlab.sensor._camera_checks import check_shared_cameras
+from mjlab.sensor.camera_sensor import check_shared_cameras
 from mjlab.utils.state import capture_state, restore_state
 
 if TYPE_CHECKING:

@@ -2,14 +2,186 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import mujoco
+import numpy as np
 import torch
 
-from mjlab.sensor._one_sided_ground import OneSidedGround
 from mjlab.sensor.raycast_sensor import RayCastData, RayCastSensor, RayCastSensorCfg
+
+# MERGED mjlab.sensor.terrain_height_sensor: Ground that rays do not see from below: planes and height fields.
+
+_PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
+_HFIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
+
+# Cells of the grid that finds the ground around a point, at most, along x and along y.
+_MOST_CELLS = 512
+
+# Single precision may put a point beyond the edge that it is on (m).
+_EDGE = 1e-3
+
+# Planes that are tested one after the other.
+_FEW = 4
+
+
+class OneSidedGround:
+    """Planes and height fields of some geom groups; tells whether a point lies below one.
+
+    Rays that start below such a surface do not meet it, so their misses do not mean that there is
+    no ground.
+    """
+
+    def __init__(
+        self,
+        mj_model: mujoco.MjModel,
+        data: Any,
+        groups: tuple[int, ...] | None,
+        device: str,
+    ) -> None:
+        m = mj_model
+        visible = np.isin(m.geom_type, (_PLANE, _HFIELD))
+        if groups is not None:
+            visible &= np.isin(m.geom_group.clip(0, 5), groups)
+        geoms = np.flatnonzero(visible)
+        self._data = data
+        self._geoms = torch.from_numpy(geoms).to(device)
+        # MuJoCo takes planes and height fields on static bodies only; but a static body may be
+        # carried by a mocap body, which every environment places for itself.
+        carried = m.body_mocapid[m.body_rootid[m.geom_bodyid[geoms]]] >= 0
+        self._is_placed_by_env = bool(carried.any())
+        host = mujoco.MjData(m)
+        mujoco.mj_kinematics(m, host)
+        self._pos = _tensor(host.geom_xpos[geoms], device)
+        self._mat = _tensor(host.geom_xmat[geoms].reshape(-1, 3, 3), device)
+        self._is_turned = bool((np.abs(host.geom_xmat[geoms] - np.eye(3).ravel()) > 1e-12).any())
+        fields = m.geom_dataid[geoms]
+        is_field = m.geom_type[geoms] == _HFIELD
+        size = np.zeros((len(geoms), 3))
+        size[~is_field] = m.geom_size[geoms[~is_field]]
+        size[is_field] = m.hfield_size[fields[is_field]][:, :3]
+        # A plane of size 0 has no end.
+        extent = np.where(size[:, :2] > 0.0, size[:, :2], np.inf)
+        self._extent = _tensor(extent, device)
+        self._elevation = _tensor(np.where(is_field, size[:, 2], 0.0), device)
+        shape = np.ones((len(geoms), 2), dtype=np.int64) * 2
+        start = np.zeros(len(geoms), dtype=np.int64)
+        shape[is_field] = np.stack((m.hfield_nrow, m.hfield_ncol), -1)[fields[is_field]]
+        start[is_field] = m.hfield_adr[fields[is_field]]
+        self._shape = torch.from_numpy(shape).to(device)
+        self._start = torch.from_numpy(start).to(device)
+        # Planes among height fields read elevations too, which then count for nothing.
+        self._has_fields = bool(is_field.any())
+        self._heights = _tensor(m.hfield_data, device)
+        is_still = not (self._has_fields or self._is_placed_by_env or self._is_turned)
+        self.is_level = is_still and len(geoms) <= _FEW
+        """True for a few level planes that stand still; see `is_above_level`."""
+        self._level_planes = list(zip(self._pos.tolist(), self._extent.tolist(), strict=True))
+        self._make_grid(host.geom_xpos[geoms], host.geom_xmat[geoms], extent, carried, device)
+
+    def _make_grid(
+        self, pos: np.ndarray, mat: np.ndarray, extent: np.ndarray, carried: np.ndarray, device: str
+    ) -> None:
+        """List the surfaces above and below each cell of a grid over x and y.
+
+        Surfaces that move, have no end or lean are listed everywhere.
+        """
+        mat = mat.reshape(-1, 3, 3)
+        is_local = ~carried & np.isfinite(extent).all(axis=1) & (mat[:, 2, 2] > 1.0 - 1e-9)
+        local = np.flatnonzero(is_local)
+        half = (np.abs(mat[local, :2, :2]) * extent[local, None, :]).sum(axis=-1) + _EDGE
+        low, high = pos[local, :2] - half, pos[local, :2] + half
+        start, end = (
+            (low.min(axis=0), high.max(axis=0)) if len(local) else (np.zeros(2), np.ones(2))
+        )
+        # With half as wide cells as the smallest surface, few surfaces meet in one.
+        narrowest = half.min(axis=0) if len(local) else np.ones(2)
+        count = np.ceil((end - start) / narrowest).clip(1, _MOST_CELLS).astype(int)
+        size = (end - start) / count
+        first = np.floor((low - start) / size).astype(int).clip(0, count - 1)
+        last = np.floor((high - start) / size).astype(int).clip(0, count - 1)
+        # The last cell is everything beyond the grid.
+        cells: list[list[int]] = [[] for _ in range(count.prod() + 1)]
+        for geom, (x0, y0), (x1, y1) in zip(local.tolist(), first, last, strict=True):
+            for x in range(x0, x1 + 1):
+                for y in range(y0, y1 + 1):
+                    cells[x * count[1] + y].append(geom)
+        everywhere = np.flatnonzero(~is_local).tolist()
+        width = max(len(cell) for cell in cells)
+        table = [cell + [-1] * (width - len(cell)) + everywhere for cell in cells]
+        self._grid = torch.tensor(table, dtype=torch.long, device=device)
+        self._grid_start, self._grid_size = _tensor(start, device), _tensor(size, device)
+        self._grid_count = torch.from_numpy(count).to(device)
+
+    def _around(self, points: torch.Tensor) -> torch.Tensor:
+        """Return the surfaces that may be above or below points (M, 3), (M, K); -1 for none."""
+        cell = ((points[:, :2] - self._grid_start) / self._grid_size).nan_to_num(-1.0).floor()
+        is_outside = ((cell < 0) | (cell >= self._grid_count)).any(dim=-1)
+        x, y = cell.clamp(min=0.0, max=float(_MOST_CELLS)).long().unbind(-1)
+        rows = torch.where(is_outside, len(self._grid) - 1, x * self._grid_count[1] + y)
+        return self._grid[rows]
+
+    def __len__(self) -> int:
+        return len(self._geoms)
+
+    def is_above(self, points: torch.Tensor, envs: torch.Tensor) -> torch.Tensor:
+        """Return whether each of the world points (M, 3) has such ground above it, (M,) bool.
+
+        `envs` (M,) says which environment each point is in.
+        """
+        found = self._around(points)
+        geoms = found.clamp(min=0)
+        pos = self._pos[geoms]
+        if self._is_placed_by_env:
+            pos = self._data.geom_xpos[envs[:, None], self._geoms[geoms]]
+        # (M, K, 3): the points in the frames of the geoms.
+        local = points[:, None] - pos
+        if self._is_placed_by_env or self._is_turned:
+            mat = self._mat[geoms]
+            if self._is_placed_by_env:
+                mat = self._data.geom_xmat[envs[:, None], self._geoms[geoms]]
+            local = (mat * local[..., :, None]).sum(dim=-2)
+        inside = (local[..., :2].abs() <= self._extent[geoms]).all(dim=-1) & (found >= 0)
+        return (inside & (local[..., 2] < self._surface(local, geoms))).any(dim=-1)
+
+    def is_above_level(self, points: torch.Tensor) -> torch.Tensor:
+        """Return the same for ground that `is_level`, plane by plane: faster than a search."""
+        result = torch.zeros_like(points[:, 0], dtype=torch.bool)
+        for position, extent in self._level_planes:
+            below = points[:, 2] < position[2]
+            for axis in range(2):
+                if extent[axis] < math.inf:
+                    below &= (points[:, axis] - position[axis]).abs() <= extent[axis]
+            result |= below
+        return result
+
+    def _surface(self, local: torch.Tensor, geoms: torch.Tensor) -> torch.Tensor:
+        """Return the height of surfaces `geoms` (...,) at local positions (..., 3), in their frames.
+
+        A height field is made of triangles: each cell is cut from its first to its last corner.
+        """
+        if not self._has_fields:
+            return torch.zeros_like(local[..., 2])
+        cells = self._shape[geoms].flip(-1) - 1
+        scaled = (local[..., :2] / self._extent[geoms] + 1.0) * 0.5 * cells
+        # Positions beyond the edge count for nothing, but have to read something.
+        scaled = torch.minimum(scaled.nan_to_num().clamp(min=0.0), cells.to(scaled.dtype))
+        corner = torch.minimum(scaled.long(), cells - 1)
+        x, y = (scaled - corner).unbind(-1)
+        columns = self._shape[geoms, 1]
+        first = self._start[geoms] + corner[..., 1] * columns + corner[..., 0]
+        h00, h01 = self._heights[first], self._heights[first + 1]
+        h10, h11 = self._heights[first + columns], self._heights[first + columns + 1]
+        lower = h00 + x * (h01 - h00) + y * (h11 - h01)
+        upper = h00 + y * (h10 - h00) + x * (h11 - h10)
+        return self._elevation[geoms] * torch.where(x >= y, lower, upper)
+
+
+def _tensor(array: Any, device: str) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array)).to(device, torch.float32)
+
 
 REDUCTIONS = ("min", "max", "mean", "none")
 

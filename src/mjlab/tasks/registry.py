@@ -20,6 +20,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjlab.compat import older_names
@@ -28,14 +29,54 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
     from mjlab.rl.config import RslRlBaseRunnerCfg
     from mjlab.rl.learners import Learner
-    from mjlab.tasks.options import TaskOptions
 
-    # Edits both configs in place; may return the learner's config that replaces the given one.
     Profile = Callable[[Any, Any], RslRlBaseRunnerCfg | None]
 
-logger = logging.getLogger(__name__)
 
+# MERGED mjlab.tasks.registry: What a task adds to the command line, and how it gets what it needs before it is built.
+#
+# A task that needs something (a recorded motion, say) is registered with a dataclass, `options=`, whose
+# fields become flags of `train`, `play`, `evaluate` and `profile-env` for this task. The scripts know
+# nothing of what is in it: they call `prepare` before they build the environment.
+
+
+@dataclass(frozen=True)
+class PolicyOrigin:
+    """Where the policy comes from that is to act, as far as there is one."""
+
+    task: str
+    """Name of the task."""
+    checkpoint: Path | None = None
+    """Its checkpoint, in the folder of its run; also the one that training goes on from."""
+    wandb_run_path: str | None = None
+    """The Weights & Biases run that the checkpoint was fetched from, as entity/project/run."""
+
+
+@dataclass
+class TaskOptions:
+    """Base of the options of a task: a dataclass with a default for each field."""
+
+    def prepare(self, env_cfg: Any, origin: PolicyOrigin) -> None:
+        """Edit the environment's config in place, fetching what it needs.
+
+        Called once, before the environment is built; by every process where there are several.
+
+        Args:
+            env_cfg: The config, with all flags applied.
+            origin: Whose policy is to act.
+
+        Raises:
+            ValueError: what is needed is not there; the message says what to do.
+        """
+
+    def runner_kwargs(self) -> dict[str, Any]:
+        """Return further keyword arguments of the task's runner."""
+        return {}
+
+
+logger = logging.getLogger(__name__)
 ENTRY_POINT_GROUP = "mjlab.tasks"
+
 # Modules that every 1.x release brought along, and that are an extra here.
 _COMPAT_MODULES = frozenset({"torchrunx", "mediapy", "moviepy"})
 
@@ -96,7 +137,7 @@ def register_mjlab_task(
             of `mjlab.rl.learners`. Flags of the command line come after it and win. It may not
             change `rl_cfg.experiment_name`, by which runs of the task are found.
         options: a dataclass of further command-line flags, which also gets what the task needs
-            before it is built (see `mjlab.tasks.options`), or its name as `module:Class`.
+            before it is built (see `mjlab.tasks.registry`), or its name as `module:Class`.
 
     Raises:
         ValueError: the name is taken, `rl_cfg` is missing, or a profile's name is no single word.

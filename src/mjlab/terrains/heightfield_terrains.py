@@ -8,32 +8,444 @@ Each is authored with its low corner at the origin, and z is that of the world.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
 
 from mjlab.compat import older_names
-from mjlab.terrains._field_obstacles import (
-    HfDiscreteObstaclesTerrainCfg as HfDiscreteObstaclesTerrainCfg,
+from mjlab.sim.memory import available_memory
+from mjlab.terrains._fields import lerp, refuse_unless, refuse_unless_positive, refuse_unless_range
+from mjlab.terrains.terrain_generator import (
+    SubTerrainCfg,
+    TerrainGeometry,
+    TerrainOutput,
+    asset_name,
 )
-from mjlab.terrains._fields import (
-    lerp,
-    refuse_unless,
-    refuse_unless_positive,
-    refuse_unless_range,
+from mjlab.terrains.utils import (
+    check_flat_patch,
+    find_flat_patches_from_heightfield,
+    interpolate_cubic,
+    resample_linear,
 )
-from mjlab.terrains._height_texture import color_by_height as color_by_height
-from mjlab.terrains._heightfield import (
-    add_heightfield,
-    add_noise,
-    check_heightfield,
-    divide_into_pixels,
-    finish,
-    refuse_unless_platform_fits,
-)
-from mjlab.terrains._perlin import fractal_noise
-from mjlab.terrains._resample import interpolate_cubic
-from mjlab.terrains.terrain_generator import SubTerrainCfg, TerrainOutput
+
+# MERGED mjlab.terrains.heightfield_terrains: Colours for height fields.
+
+
+# The height above or below z = 0, in metres, at which colours stop changing.
+_FULL_COLOR_HEIGHT = 0.75
+
+# The hue at z = 0, a green; it goes to red above and to blue below.
+_GROUND_HUE = 0.33
+
+
+def color_by_height(
+    spec: mujoco.MjSpec,
+    noise: np.ndarray,
+    unique_id: str,
+    physical_heights: np.ndarray,
+    texture_size: int = 128,
+) -> str:
+    """Add a texture that shows heights, and a material with it, and return the material's name.
+
+    The scale is absolute and the same for all terrains: with `s = clip(h / 0.75, -1, 1)`, the hue
+    is `0.33 (1 - s)` and saturation and value are `0.45 + 0.25 |s|`, so that ground at z = 0 is
+    green, hills turn red and hollows blue.
+
+    Args:
+        spec: Where to add them.
+        noise: Heights in pixels' units. They are not read: colours follow `physical_heights`.
+        unique_id: Name of the texture and of the material.
+        physical_heights: (rows, cols) heights above z = 0, in metres, [row, col].
+        texture_size: Width and height of the texture, in pixels.
+    """
+    heights = resample_linear(np.asarray(physical_heights, float), (texture_size, texture_size))
+    level = np.clip(heights / _FULL_COLOR_HEIGHT, -1.0, 1.0)
+    vividness = 0.45 + 0.25 * np.abs(level)
+    rgb = hsv_to_rgb(_GROUND_HUE * (1.0 - level), vividness, vividness)
+    # Rows of a field go up along y, and rows of a texture go down.
+    pixels = (rgb * 255.0).astype(np.uint8)[::-1]
+    texture = spec.add_texture(
+        name=unique_id,
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        width=texture_size,
+        height=texture_size,
+        nchannel=3,
+    )
+    texture.data = pixels.tobytes()
+    material = spec.add_material(name=unique_id)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = unique_id
+    return unique_id
+
+
+def hsv_to_rgb(hue: np.ndarray, saturation: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Convert arrays of any shape S to RGB of shape (*S, 3); everything is from 0 to 1.
+
+    Channel n is `v - v s max(0, min(k, 4 - k, 1))` with `k = (n + 6 h) mod 6` and n = 5, 3, 1.
+    """
+    k = (np.array([5.0, 3.0, 1.0]) + 6.0 * hue[..., None]) % 6.0
+    drop = np.clip(np.minimum(k, 4.0 - k), 0.0, 1.0)
+    return (value * 1.0)[..., None] - (value * saturation)[..., None] * drop
+
+
+# MERGED mjlab.terrains.heightfield_terrains: What all height fields share: their checks, their pixels, and the MuJoCo field with its texture.
+
+
+# A thin sheet lets fast or deep contacts through to the other side.
+MIN_BASE_THICKNESS = 0.5
+
+# How far around the centre a robot may be placed, and how far it may reach.
+SPAWN_RADIUS = 1.0
+
+# A mistyped pixel size should be told, rather than fill the memory.
+_MAX_PIXELS = 10_000_000
+
+# Bytes of a pixel, at least: its height in the spec, in the model and in the host data's model, and color.
+_BYTES_PER_PIXEL = 14
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """How a sub-terrain is divided into pixels. Arrays are indexed [row, col]: rows run along y."""
+
+    rows: int
+    """Number of pixels along y, border included."""
+    cols: int
+    """Number of pixels along x, border included."""
+    border: int
+    """Width of the border, which stays at height 0, in pixels."""
+    inner_size: tuple[float, float]
+    """Extent of the ground inside the border along x and y, in metres."""
+
+    @property
+    def inner(self) -> tuple[int, int]:
+        """Number of rows and columns inside the border."""
+        return self.rows - 2 * self.border, self.cols - 2 * self.border
+
+    def with_border(self, inner: np.ndarray) -> np.ndarray:
+        """Return heights of the whole field, from (rows, cols) ones inside the border."""
+        return np.pad(inner, self.border)
+
+
+def divide_into_pixels(cfg: SubTerrainCfg, pixel_field: str = "horizontal_scale") -> Pixels:
+    """Divide `cfg.size` into pixels of the size in the given field of the config.
+
+    The number of columns comes from the x size and that of rows from the y size, both truncated.
+
+    Raises:
+        ValueError: pixels or border do not fit the size.
+    """
+    refuse_unless_positive(cfg, pixel_field)
+    pixel, border_width = getattr(cfg, pixel_field), getattr(cfg, "border_width")  # noqa: B009
+    refuse_unless(
+        border_width == 0.0 or border_width >= pixel,
+        cfg,
+        "border_width",
+        f"it must be 0, or at least one pixel ({pixel_field} = {pixel:g} m).",
+    )
+    refuse_unless(
+        all(extent / pixel <= _MAX_PIXELS for extent in cfg.size),
+        cfg,
+        pixel_field,
+        f"expected at most {_MAX_PIXELS:,} pixels of {tuple(cfg.size)} m. Use larger ones.",
+    )
+    border = int(border_width / pixel)
+    cols, rows = (int(extent / pixel) for extent in cfg.size)
+    refuse_unless(
+        min(rows, cols) - 2 * border >= 2,
+        cfg,
+        "size",
+        f"with {pixel_field} = {pixel:g} and border_width = {border_width:g} that leaves less than "
+        "2 x 2 pixels of ground. Make it larger, or the pixels or the border smaller.",
+    )
+    refuse_unless(
+        rows * cols <= _MAX_PIXELS,
+        cfg,
+        pixel_field,
+        f"that makes {rows * cols:,} pixels of {tuple(cfg.size)} m. Use larger ones; at most "
+        f"{_MAX_PIXELS:,} are allowed.",
+    )
+    if border == 0:
+        return Pixels(rows, cols, 0, (cfg.size[0], cfg.size[1]))
+    inner_size = ((cols - 2 * border) * pixel, (rows - 2 * border) * pixel)
+    return Pixels(rows, cols, border, inner_size)
+
+
+def refuse_unless_platform_fits(cfg: Any) -> None:
+    """Raise `ValueError` unless the platform fits inside the border."""
+    room = min(cfg.size) - 2.0 * cfg.border_width
+    refuse_unless(
+        0.0 <= cfg.platform_width <= room,
+        cfg,
+        "platform_width",
+        f"it must be from 0 to {room:g} m, which is what the border leaves of the size "
+        f"{tuple(cfg.size)}.",
+    )
+
+
+@dataclass(frozen=True)
+class Heightfield:
+    """A height field in a spec, and the surface that it shows."""
+
+    hfield: mujoco.MjsHField
+    geom: mujoco.MjsGeom
+    surface: np.ndarray
+    """(rows, cols) heights of the vertices, in metres; z of the world."""
+    size: tuple[float, float]
+    """Extent along x and y, in metres. Vertices are at multiples of size / (n - 1)."""
+
+    def highest_near_centre(self, radius: float = SPAWN_RADIUS) -> float:
+        """Return the highest vertex within `radius` of the centre, in metres."""
+        y, x = (
+            np.linspace(-extent / 2, extent / 2, count)
+            for extent, count in zip(self.size[::-1], self.surface.shape, strict=True)
+        )
+        squared = y[:, None] ** 2 + x[None, :] ** 2
+        # On a field with fewer vertices than that, the ones around the centre count.
+        return float(self.surface[squared <= max(radius**2, squared.min() + 1e-9)].max())
+
+
+def add_heightfield(
+    spec: mujoco.MjSpec,
+    size: tuple[float, float],
+    surface: np.ndarray,
+    thickness_ratio: float,
+    flat_elevation: float,
+) -> Heightfield:
+    """Add a height field whose surface is exactly `surface` to the body `terrain` of the spec.
+
+    MuJoCo stores elevations from 0 to 1, with rows along +y and columns along +x; vertices are
+    `size / (n - 1)` apart. The geom is centred at half the size, at the height of the lowest
+    vertex. Below that is a base of `thickness_ratio` times the elevation, at least 0.5 m.
+
+    Args:
+        spec: Where to add it.
+        size: Extent along x and y, in metres.
+        surface: (rows, cols) heights in metres, [row, col].
+        thickness_ratio: Thickness of the base over the elevation.
+        flat_elevation: The elevation that a flat field states, in metres; MuJoCo refuses 0.
+    """
+    # Each sub-terrain has a field of its own, and a picture of it.
+    pixels = surface.size + sum(field.nrow * field.ncol for field in spec.hfields)
+    memory = available_memory("cpu")
+    if memory is not None and pixels * _BYTES_PER_PIXEL > memory:
+        raise ValueError(
+            f"Height fields: expected at most {memory // _BYTES_PER_PIXEL:,} pixels, which is what "
+            f"{memory / 1e9:.1f} GB of memory can hold, got {pixels:,} so far; use a larger "
+            "horizontal_scale, or fewer sub-terrains."
+        )
+    low = float(surface.min())
+    span = float(surface.max()) - low
+    elevation = span if span > 0.0 else flat_elevation
+    name = asset_name(spec, "hfield")
+    hfield = spec.add_hfield(
+        name=name,
+        nrow=surface.shape[0],
+        ncol=surface.shape[1],
+        size=(
+            size[0] / 2,
+            size[1] / 2,
+            elevation,
+            max(elevation * thickness_ratio, MIN_BASE_THICKNESS),
+        ),
+        userdata=((surface - low) / elevation).ravel().tolist(),
+    )
+    geom = spec.body("terrain").add_geom(
+        type=mujoco.mjtGeom.mjGEOM_HFIELD,
+        hfieldname=name,
+        pos=(size[0] / 2, size[1] / 2, low),
+        material=color_by_height(spec, surface, name, surface),
+    )
+    return Heightfield(hfield, geom, surface, (size[0], size[1]))
+
+
+def add_noise(cfg: Any, spec: mujoco.MjSpec, noise: np.ndarray) -> Heightfield:
+    """Add a field of whole multiples of `vertical_scale`."""
+    return add_heightfield(
+        spec, cfg.size, noise * cfg.vertical_scale, cfg.base_thickness_ratio, cfg.vertical_scale
+    )
+
+
+def check_heightfield(cfg: SubTerrainCfg, *scales: str) -> None:
+    """Check what all height fields have. `scales` are fields that have to be positive."""
+    refuse_unless_positive(cfg, "horizontal_scale", "base_thickness_ratio", *scales)
+    for name, patch in (cfg.flat_patch_sampling or {}).items():
+        check_flat_patch(name, patch, cfg.size)
+
+
+def finish(
+    cfg: Any,
+    field: Heightfield,
+    spawn_height: float,
+    rng: np.random.Generator,
+    pixel: float | None = None,
+) -> TerrainOutput:
+    """Return a field and its spawn point, and draw its flat patches."""
+    low = float(field.surface.min())
+    patches = {
+        name: find_flat_patches_from_heightfield(
+            field.surface - low, pixel or cfg.horizontal_scale, low, patch, rng, size=field.size
+        )
+        for name, patch in (cfg.flat_patch_sampling or {}).items()
+    }
+    return TerrainOutput(
+        origin=np.array([field.size[0] / 2, field.size[1] / 2, spawn_height]),
+        # It keeps the colours of its texture.
+        geometries=[TerrainGeometry(geom=field.geom, hfield=field.hfield)],
+        flat_patches=patches or None,
+    )
+
+
+# MERGED mjlab.terrains.heightfield_terrains: A height field with blocks and pits. Its public home is `heightfield_terrains`.
+
+
+# Obstacles stand, and their footprints grow, in steps of this many pixels.
+_OBSTACLE_STEP = 4
+
+
+@dataclass(kw_only=True)
+class HfDiscreteObstaclesTerrainCfg(SubTerrainCfg):
+    """Blocks and pits of random sizes at random places."""
+
+    obstacle_height_mode: Literal["choice", "fixed"] = "choice"
+    """`fixed` gives every obstacle the full height; `choice` draws from the full and half height,
+    up and down."""
+    obstacle_width_range: tuple[float, float]
+    """Smallest and largest side of an obstacle, in metres."""
+    obstacle_height_range: tuple[float, float]
+    """Full height of obstacles at difficulty 0 and 1, in metres."""
+    num_obstacles: int
+    """Number of obstacles; later ones overwrite earlier ones."""
+    platform_width: float = 1.0
+    """Side of the square at the centre that is cleared, in metres."""
+    horizontal_scale: float = 0.1
+    """Size of a pixel, in metres."""
+    vertical_scale: float = 0.005
+    """Step of heights, in metres."""
+    base_thickness_ratio: float = 1.0
+    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
+    border_width: float = 0.0
+    """Width of the flat border, in metres: 0, or at least one pixel."""
+    square_obstacles: bool = False
+    """Whether obstacles are as long as they are wide."""
+    origin_z_offset: float = 0.0
+    """How far above the platform robots start, in metres."""
+
+    def function(
+        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
+    ) -> TerrainOutput:
+        """Add the terrain; robots start on the platform.
+
+        Obstacles begin at every fourth pixel inside the border, and are cut off where it ends.
+        """
+        self._check_obstacles()
+        pixels = divide_into_pixels(self)
+        refuse_unless_platform_fits(self)
+        full = int(lerp(self.obstacle_height_range, difficulty) / self.vertical_scale)
+        heights = [full] if self.obstacle_height_mode == "fixed" else _levels(full)
+        narrow, wide = (int(width / self.horizontal_scale) for width in self.obstacle_width_range)
+        sides = np.arange(narrow, wide + 1, _OBSTACLE_STEP)
+        inner = np.zeros(pixels.inner, dtype=int)
+        starts = [np.arange(0, count, _OBSTACLE_STEP) for count in pixels.inner]
+        for _ in range(self.num_obstacles):
+            height, width = rng.choice(heights), rng.choice(sides)
+            length = width if self.square_obstacles else rng.choice(sides)
+            row, col = (rng.choice(start) for start in starts)
+            inner[row : row + width, col : col + length] = height
+        noise = pixels.with_border(inner)
+        half = int(self.platform_width / self.horizontal_scale) // 2
+        row, col = pixels.rows // 2, pixels.cols // 2
+        noise[row - half : row + half, col - half : col + half] = 0
+        field = add_noise(self, spec, noise)
+        # Without a platform robots stand on whatever there is at the centre.
+        around = max(half, 1)
+        ground = field.surface[row - around : row + around, col - around : col + around].max()
+        return finish(self, field, float(ground) + self.origin_z_offset, rng)
+
+    def _check_obstacles(self) -> None:
+        """Raise `ValueError` for obstacles that cannot be made."""
+        check_heightfield(self, "vertical_scale")
+        refuse_unless(
+            self.obstacle_height_mode in ("choice", "fixed"),
+            self,
+            "obstacle_height_mode",
+            "it must be 'choice' or 'fixed'.",
+        )
+        refuse_unless_range(self, "obstacle_width_range", lowest=self.horizontal_scale)
+        refuse_unless_range(self, "obstacle_height_range", lowest=0.0)
+        refuse_unless(self.num_obstacles >= 0, self, "num_obstacles", "it must not be negative.")
+
+
+def _levels(full: int) -> list[int]:
+    """Return what `choice` draws from, in units of `vertical_scale`."""
+    return [-full, -full // 2, full // 2, full]
+
+
+# MERGED mjlab.terrains.heightfield_terrains: Fractal gradient noise.
+
+
+# Gradients by the last two bits of a hash: x + y, x - y, -x + y, -x - y.
+_SIGNS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+
+
+def fractal_noise(
+    shape: tuple[int, int],
+    frequency: float,
+    octaves: int,
+    persistence: float,
+    lacunarity: float,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Return (rows, cols) noise, stretched to run from 0 to 1; zeros if there is none.
+
+    Octave k adds gradient noise (K. Perlin, "Improving noise", SIGGRAPH 2002) with
+    `frequency * lacunarity^k` cells along each side and the weight `persistence^k`.
+
+    Args:
+        shape: Number of rows and columns.
+        frequency: Cells of the first octave along each side.
+        octaves: Number of octaves.
+        persistence: How much weaker each octave is than the one before.
+        lacunarity: How much finer each octave is than the one before.
+        rng: Draws the permutation of the lattice's gradients.
+    """
+    permutation = np.tile(rng.permutation(256), 2)
+    total, weights = np.zeros(shape), 0.0
+    for octave in range(octaves):
+        cells, weight = frequency * lacunarity**octave, persistence**octave
+        rows, cols = (np.arange(count) * cells / count for count in shape)
+        total += weight * _gradient_noise(rows[:, None], cols[None, :], permutation)
+        weights += weight
+    total /= weights
+    low, span = total.min(), np.ptp(total)
+    return (total - low) / span if span > 0.0 else np.zeros(shape)
+
+
+def _gradient_noise(x: np.ndarray, y: np.ndarray, permutation: np.ndarray) -> np.ndarray:
+    """Return noise at lattice coordinates x, (n, 1), and y, (1, m), from a doubled permutation."""
+    x_cell, y_cell = np.floor(x).astype(int), np.floor(y).astype(int)
+    x_in, y_in = x - x_cell, y - y_cell
+    x_cell, y_cell = x_cell % 256, y_cell % 256
+    corners = [
+        [
+            _slope(permutation[permutation[x_cell + i] + y_cell + j], x_in - i, y_in - j)
+            for j in (0, 1)
+        ]
+        for i in (0, 1)
+    ]
+    u, v = _fade(x_in), _fade(y_in)
+    low, high = (near + v * (far - near) for near, far in corners)
+    return low + u * (high - low)
+
+
+def _slope(hashes: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    signs = _SIGNS[hashes % 4]
+    return signs[..., 0] * x + signs[..., 1] * y
+
+
+def _fade(t: np.ndarray) -> np.ndarray:
+    return t**3 * (t * (t * 6.0 - 15.0) + 10.0)
+
 
 # A field of Perlin noise is at least this high, in metres.
 _MIN_PERLIN_HEIGHT = 0.001

@@ -3,16 +3,195 @@
 from __future__ import annotations
 
 import copy
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Generator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
 
-from mjlab.terrains import _surroundings
-from mjlab.terrains._checks import check_generator, check_output
-from mjlab.terrains._names import naming_cell
+from mjlab.terrains.utils import make_border
+
+# MERGED mjlab.terrains.terrain_generator: Terrain configs that cannot be built are refused here, before anything is built.
+
+_COLOR_SCHEMES = ("height", "random", "none")
+
+
+def check_generator(cfg: TerrainGeneratorCfg) -> None:
+    """Raise ValueError, with what to change, for a config that cannot be built."""
+    if not cfg.sub_terrains:
+        raise ValueError(
+            "TerrainGeneratorCfg.sub_terrains is empty. Give at least one sub-terrain, such as "
+            "{'flat': BoxFlatTerrainCfg()}."
+        )
+    if len(cfg.size) != 2 or not all(math.isfinite(side) and side > 0.0 for side in cfg.size):
+        raise ValueError(
+            f"TerrainGeneratorCfg.size is {tuple(cfg.size)}; it must be two positive lengths, in "
+            "metres."
+        )
+    for name in ("num_rows", "num_cols"):
+        if getattr(cfg, name) < 1:
+            raise ValueError(
+                f"TerrainGeneratorCfg.{name} is {getattr(cfg, name)}; it must be at least 1."
+            )
+    if cfg.color_scheme not in _COLOR_SCHEMES:
+        raise ValueError(
+            f"TerrainGeneratorCfg.color_scheme is {cfg.color_scheme!r}; it must be one of "
+            f"{', '.join(_COLOR_SCHEMES)}."
+        )
+    _check_difficulties(cfg.difficulty_range)
+    _check_proportions({name: sub.proportion for name, sub in cfg.sub_terrains.items()})
+    for name, sub in cfg.sub_terrains.items():
+        _check_sub_terrain(name, sub, min(cfg.size))
+
+
+def check_output(output: TerrainOutput, patches: dict[str, np.ndarray]) -> None:
+    """Raise ValueError if the function of a sub-terrain returned what cannot be used."""
+    origin = np.asarray(output.origin)
+    if origin.shape != (3,) or not np.isfinite(origin).all():
+        raise ValueError(f"its origin is {output.origin}; it must be three finite numbers.")
+    for name, found in (output.flat_patches or {}).items():
+        if name not in patches:
+            raise ValueError(
+                f"it returned flat patches {name!r}, which SubTerrainCfg.flat_patch_sampling does "
+                f"not have; that has {sorted(patches)}."
+            )
+        room = patches[name].shape[2]
+        if np.ndim(found) != 2 or np.shape(found)[1] != 3 or len(found) > room:
+            raise ValueError(
+                f"its flat patches {name!r} have the shape {np.shape(found)}; it must be (n, 3) "
+                f"with at most {room} patches, as configured."
+            )
+
+
+def _check_difficulties(bounds: tuple[float, float]) -> None:
+    if not 0.0 <= bounds[0] <= bounds[1] <= 1.0:
+        raise ValueError(
+            f"TerrainGeneratorCfg.difficulty_range is {tuple(bounds)}; it must be (lowest, "
+            "highest), both from 0 to 1."
+        )
+
+
+def _check_proportions(proportions: dict[str, float]) -> None:
+    bad = {name: p for name, p in proportions.items() if not (math.isfinite(p) and p >= 0.0)}
+    if bad:
+        raise ValueError(
+            f"SubTerrainCfg.proportion is negative or not finite for {bad}. Use 0 or more; "
+            "proportions are relative to each other."
+        )
+    if sum(proportions.values()) <= 0.0:
+        raise ValueError(
+            f"SubTerrainCfg.proportion is 0 for all of {sorted(proportions)}. At least one must "
+            "be positive."
+        )
+
+
+def _check_sub_terrain(name: str, sub: SubTerrainCfg, side: float) -> None:
+    """Check the fields that most sub-terrains have against the shorter side of a cell."""
+    where = f"Sub-terrain {name!r} ({type(sub).__name__})"
+    platform: Any = getattr(sub, "platform_width", 0.0)
+    if not 0.0 <= platform <= side:
+        raise ValueError(
+            f"{where}: platform_width is {platform}; it must be from 0 to the size of the "
+            f"terrain, {side} m."
+        )
+    border: Any = getattr(sub, "border_width", 0.0)
+    if not 0.0 <= border < side / 2:
+        raise ValueError(
+            f"{where}: border_width is {border}; it must be at least 0 and thinner than half the "
+            f"terrain, {side / 2} m."
+        )
+    for key, patch in (sub.flat_patch_sampling or {}).items():
+        if patch.num_patches < 1 or patch.patch_radius < 0.0:
+            raise ValueError(
+                f"{where}: flat_patch_sampling[{key!r}] asks for {patch.num_patches} patches of "
+                f"radius {patch.patch_radius} m; it must be at least 1, of radius 0 or more."
+            )
+
+
+# MERGED mjlab.terrains.terrain_generator: What surrounds the grid of sub-terrains: the frame, the light, and names for all geoms.
+
+_DARK_GREY = (0.2, 0.2, 0.2)
+
+
+def add_border(
+    body: mujoco.MjsBody,
+    extent: tuple[float, float],
+    width: float,
+    height: float,
+    color: np.ndarray | None,
+) -> None:
+    """Add a frame around the grid.
+
+    Args:
+        body: The body of the terrain.
+        extent: Extent of the grid along x and y, in metres; it is centred on the origin.
+        width: Width of the frame, in metres.
+        height: Thickness of the frame below z = 0, or, negative, height of a wall above it.
+        color: (3,) red, green and blue; None is a dark grey.
+    """
+    outer = (extent[0] + 2.0 * width, extent[1] + 2.0 * width)
+    for geom in make_border(body, outer, extent, abs(height), (0.0, 0.0, -height / 2)):
+        geom.rgba = (*(_DARK_GREY if color is None else color), 1.0)
+
+
+def add_light(body: mujoco.MjsBody, extent: tuple[float, float]) -> None:
+    """Add a light that shines straight down on the grid, from a height that suits its extent."""
+    body.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=(0.0, 0.0, 0.6 * max(extent)),
+        dir=(0.0, 0.0, -1.0),
+    )
+
+
+def finish_geoms(body: mujoco.MjsBody) -> None:
+    """Name the geoms that have no name `terrain_<k>`, k counting all, and make all weightless.
+
+    The ground's mass would be most of the model's, whose mean mass scales what viewers draw.
+    """
+    for index, geom in enumerate(body.geoms):
+        geom.mass = 0.0
+        if not geom.name:
+            geom.name = f"terrain_{index}"
+
+
+# MERGED mjlab.terrains.terrain_generator: Names of the assets that sub-terrains add to the spec.
+
+
+# A sub-terrain's function is given difficulty, spec and generator, but not the cell that it fills.
+_CELL: ContextVar[tuple[int, int] | None] = ContextVar("cell", default=None)
+
+
+@contextmanager
+def naming_cell(row: int, col: int) -> Generator[None]:
+    """Let `asset_name` name what is added in this context after the cell."""
+    token = _CELL.set((row, col))
+    try:
+        yield
+    finally:
+        _CELL.reset(token)
+
+
+def asset_name(spec: mujoco.MjSpec, kind: str) -> str:
+    """Return a name for an asset of a sub-terrain, `<kind>_<row>_<column>` in a generated grid.
+
+    Elsewhere the name ends with the number of assets that the spec has, so that it is new after
+    each added asset. The same calls give the same names, in every process.
+
+    Args:
+        spec: The spec that will hold the asset.
+        kind: What the asset is, `hfield` say. Different for each asset of one sub-terrain.
+    """
+    cell = _CELL.get()
+    if cell is not None:
+        return f"{kind}_{cell[0]}_{cell[1]}"
+    count = len(spec.hfields) + len(spec.meshes) + len(spec.textures) + len(spec.materials)
+    return f"{kind}_{count}"
+
 
 # What the scheme `none` gives every geom.
 _PLAIN = (0.5, 0.5, 0.5, 1.0)
@@ -175,12 +354,10 @@ class TerrainGenerator:
         extent = (self.num_rows * self.cfg.size[0], self.num_cols * self.cfg.size[1])
         if self.cfg.border_width > 0.0:
             color = self.np_rng.random(3) if self.cfg.color_scheme == "random" else None
-            _surroundings.add_border(
-                body, extent, self.cfg.border_width, self.cfg.border_height, color
-            )
+            add_border(body, extent, self.cfg.border_width, self.cfg.border_height, color)
         if self.cfg.add_lights:
-            _surroundings.add_light(body, extent)
-        _surroundings.finish_geoms(body)
+            add_light(body, extent)
+        finish_geoms(body)
 
     # The grid.
 

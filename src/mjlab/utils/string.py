@@ -88,6 +88,14 @@ def name_list(names: Sequence[str], near: Iterable[str]) -> str:
     return f"{shown} and {len(names) - len(shown)} others"
 
 
+def suggest(name: str, available: Iterable[str]) -> str:
+    """Return a hint for an unknown `name`: "did you mean 'y'? Available: ['x', 'y']."."""
+    names = list(available)
+    close = difflib.get_close_matches(name, names, n=_SHOWN, cutoff=0.5)
+    question = f"did you mean {' or '.join(map(repr, close))}? " if close else ""
+    return f"{question}Available: {name_list(names, near=[name])}."
+
+
 def _report_unmatched(patterns: Iterable[re.Pattern[str]], names: Sequence[str]) -> None:
     # Nothing can match where there are no names: the default pattern ".*" of an entity without
     # joints is no mistake.

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path, PurePosixPath
+from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
@@ -105,3 +110,173 @@ def _has_only_pixels(texture: mujoco.MjsTexture) -> bool:
         or texture.builtin != mujoco.mjtBuiltin.mjBUILTIN_NONE
     )
     return not has_source and len(texture.data) > 0
+
+
+# MERGED mjlab.utils.xml: Writing a spec as a folder (or archive) that holds its XML and every file it refers to.
+
+_ASSETS = "assets"
+_XML_NAME = "scene.xml"
+
+
+def export_spec(spec: mujoco.MjSpec, output_dir: Path, *, zip: bool = False) -> None:
+    """Write `scene.xml` and, under `assets/`, the files it refers to. `spec` is not changed.
+
+    Textures made from raw pixels are left out, with the materials that use them, because XML
+    cannot hold them. With `zip` the result is the archive `<output_dir>.zip` instead of a folder.
+
+    Raises `ValueError` if a file cannot be found, or if the spec has been attached to another one.
+    """
+    if spec.parent is not None:
+        # MuJoCo would end the process.
+        raise ValueError(
+            f"The spec {spec.modelname!r} has been attached to another one, and MuJoCo cannot "
+            "write it any more. Write the whole (`spec.parent`), or a copy made before attaching."
+        )
+    output_dir = Path(output_dir)
+    if not zip:
+        _write_folder(spec, output_dir)
+        return
+    output_dir.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as temporary:
+        # Not named after `output_dir`, whose last part may be "..".
+        folder = Path(temporary) / "scene"
+        _write_folder(spec, folder)
+        shutil.make_archive(str(output_dir), "zip", root_dir=folder)
+
+
+def make_asset_paths_absolute(spec: mujoco.MjSpec, model_dir: str | None = None) -> None:
+    """Turn relative paths of files on disk into absolute ones. Changes `spec`.
+
+    Attaching forgets the folder a spec was read from, so do this before. Paths that are keys of
+    `spec.assets`, or lead to no file, are left alone.
+
+    Args:
+        spec: The spec.
+        model_dir: The folder of its XML file; None takes `spec.modelfiledir`.
+    """
+    model_dir = spec.modelfiledir if model_dir is None else model_dir
+    for place in _file_places(spec):
+        if _asset_key(spec, place) is None and not PurePosixPath(place.path).is_absolute():
+            path = Path(model_dir, place.folder, place.path).absolute()
+            if path.is_file():
+                place.rename(str(path))
+
+
+def put_files_in_memory(spec: mujoco.MjSpec, prefix: str) -> None:
+    """Bring all files that a spec refers to into `spec.assets`, as `<prefix><file>`. Changes `spec`.
+
+    Specs that are merged need that if one of them has files in memory: attaching a spec with such
+    files renames those on disk too, and a path on disk may be taken for a file in memory that ends
+    alike.
+
+    Raises `ValueError` if a file cannot be found.
+    """
+    contents: dict[str, bytes] = {}
+    for place in list(_file_places(spec)):
+        content = _read(spec, place, spec.modelfiledir)
+        name = _unique_name(place, content, contents)
+        contents[name] = content
+        place.rename(prefix + name.replace("/", "_"))
+    spec.assets = {prefix + name.replace("/", "_"): contents[name] for name in contents}
+
+
+class _FilePlace:
+    """One attribute of one element that names a file."""
+
+    def __init__(self, element: Any, path: str, folder: str, write: Callable[[str], None]) -> None:
+        self.element = element
+        self.path = path
+        self.folder = folder
+        self._write = write
+
+    def rename(self, path: str) -> None:
+        # An element without a name is called after its file.
+        if not self.element.name:
+            self.element.name = PurePosixPath(self.path).stem
+        self._write(path)
+
+
+def _file_places(spec: mujoco.MjSpec) -> Iterator[_FilePlace]:
+    def place(element: Any, folder: str) -> _FilePlace:
+        return _FilePlace(element, element.file, folder, lambda new: setattr(element, "file", new))
+
+    for element in (*spec.meshes, *spec.hfields, *spec.skins):
+        if element.file:
+            yield place(element, element.compiler.meshdir)
+    for texture in spec.textures:
+        folder = texture.compiler.texturedir
+        if texture.file:
+            yield place(texture, folder)
+        for side, path in enumerate(texture.cubefiles):
+            if path:
+                yield _FilePlace(texture, path, folder, _cube_writer(texture, side))
+
+
+def _cube_writer(texture: mujoco.MjsTexture, side: int) -> Callable[[str], None]:
+    def write(path: str) -> None:
+        texture.cubefiles[side] = path
+
+    return write
+
+
+def _asset_key(spec: mujoco.MjSpec, place: _FilePlace) -> str | None:
+    """Return the key of `spec.assets` for a path: itself, in its folder, or one that ends so."""
+    keys = spec.assets.keys()
+    for key in (place.path, str(PurePosixPath(place.folder, place.path))):
+        if key in keys:
+            return key
+    endings = [key for key in keys if key.endswith("/" + place.path)]
+    # A name in the file's own folder is the better match where several end alike.
+    endings.sort(key=lambda key: (place.folder not in key, key))
+    return endings[0] if endings else None
+
+
+def _read(spec: mujoco.MjSpec, place: _FilePlace, model_dir: str) -> bytes:
+    key = _asset_key(spec, place)
+    if key is not None:
+        content = spec.assets[key]
+        return content.encode() if isinstance(content, str) else content
+    path = Path(model_dir, place.folder, place.path)
+    if not path.is_file():
+        raise ValueError(
+            f"{type(place.element).__name__} {place.element.name!r} refers to the file "
+            f"{place.path!r}, which is neither at {str(path)!r} nor among the assets of the spec "
+            f"({sorted(spec.assets)}). Add it to `spec.assets`, or call "
+            "`make_asset_paths_absolute` on a spec before attaching it."
+        )
+    return path.read_bytes()
+
+
+def _write_folder(spec: mujoco.MjSpec, folder: Path) -> None:
+    # Everything that can fail comes before the first file is written.
+    copy = spec.copy()
+    strip_buffer_textures(copy)
+    contents: dict[str, bytes] = {}
+    names: list[tuple[_FilePlace, str]] = []
+    for place in _file_places(copy):
+        content = _read(copy, place, spec.modelfiledir)
+        names.append((place, _unique_name(place, content, contents)))
+        contents[names[-1][1]] = content
+    for place, name in names:
+        place.rename(name)
+    copy.meshdir = copy.texturedir = ""
+    copy.assets = contents
+    xml = fix_spec_xml(copy.to_xml(), meshdir=_ASSETS if contents else None)
+    for name, content in contents.items():
+        path = folder / _ASSETS / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / _XML_NAME).write_text(xml)
+
+
+def _unique_name(place: _FilePlace, content: bytes, taken: dict[str, bytes]) -> str:
+    """Return the path of a file below the assets folder: its own where that is free."""
+    path = PurePosixPath(place.path)
+    if path.is_absolute() or ".." in path.parts:
+        path = PurePosixPath(path.name)
+    candidate, number = path, 1
+    while taken.get(str(candidate), content) != content:
+        candidate = path.with_name(f"{path.stem}_{number}{path.suffix}")
+        number += 1
+    return str(candidate)

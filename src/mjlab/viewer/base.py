@@ -3,25 +3,322 @@
 from __future__ import annotations
 
 import contextlib
+import enum
+import inspect
 import logging
+import math
 import queue
 import time
 import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator
-from typing import Any, ClassVar
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
+import numpy as np
 import torch
 
 from mjlab.compat import older_names
-from mjlab.viewer.interrupt import first_interrupt_calls
-from mjlab.viewer.pacing import SPEEDS, RateMeter, RealtimePacer, speed_label
-from mjlab.viewer.protocols import EnvProtocol as EnvProtocol
-from mjlab.viewer.protocols import PolicyProtocol as PolicyProtocol
-from mjlab.viewer.protocols import VerbosityLevel as VerbosityLevel
-from mjlab.viewer.protocols import ViewerAction as ViewerAction
-from mjlab.viewer.protocols import ViewerStatus as ViewerStatus
-from mjlab.viewer.protocols import ended, forget
+from mjlab.utils.signals import first_interrupt_calls
+
+if TYPE_CHECKING:
+    import torch
+
+    from mjlab.envs import ManagerBasedRlEnvCfg
+
+
+# MERGED mjlab.viewer.base: When to step and when to draw, so that the simulation keeps to real time.
+
+SPEEDS = tuple(2.0**exponent for exponent in range(-5, 4))
+"""Speeds a viewer offers, as multiples of real time: 1/32, 1/16, ... 8."""
+_STATS_WINDOW_S = 0.5
+
+
+def speed_label(multiplier: float) -> str:
+    """A speed as people write it: `1/4x`, `1x`, `8x`."""
+    if multiplier < 1.0:
+        return f"1/{round(1.0 / multiplier)}x"
+    return f"{multiplier:g}x"
+
+
+class RealtimePacer:
+    """Turns elapsed wall time into a budget of simulated time to step through.
+
+    Time that could not be used within one frame is dropped except for a single step: a simulation
+    that is slower than asked for runs late, and the screen still answers.
+    """
+
+    def __init__(self, step_dt: float, frame_period: float, speeds: Sequence[float] = SPEEDS):
+        self.step_dt = step_dt
+        self.frame_period = frame_period
+        self.capped = False
+        self._speeds = tuple(speeds)
+        self._budget = 0.0
+        self.reset_speed()
+
+    @property
+    def speed(self) -> float:
+        """Target speed as a multiple of real time."""
+        return self._speeds[self._speed_index]
+
+    def change_speed(self, steps: int) -> None:
+        """Go `steps` up (or down, where negative) in the list of speeds, within its ends."""
+        self._speed_index = min(max(self._speed_index + steps, 0), len(self._speeds) - 1)
+
+    def reset_speed(self) -> None:
+        """Select real time, or the speed nearest to it."""
+        ratios = [abs(math.log(speed)) for speed in self._speeds]
+        self._speed_index = ratios.index(min(ratios))
+
+    def add(self, elapsed: float) -> None:
+        """Add `elapsed` seconds of wall time to the budget."""
+        self._budget += elapsed * self.speed
+
+    def take_step(self) -> bool:
+        """Whether there is time for one more step; it is taken off the budget."""
+        # Adding many small times leaves rounding errors, which must not cost a whole step.
+        if self._budget < self.step_dt * (1.0 - 1e-9):
+            return False
+        self._budget = max(self._budget - self.step_dt, 0.0)
+        return True
+
+    @property
+    def time_to_next_step(self) -> float:
+        """Wall time in seconds until the budget is enough for a step."""
+        return max(self.step_dt - self._budget, 0.0) / self.speed
+
+    def out_of_time(self) -> None:
+        """Say that this frame's wall time is used up; what is left is cut to one step."""
+        self.capped = self._budget >= self.step_dt
+        self._budget = min(self._budget, self.step_dt)
+
+    def clear(self) -> None:
+        """Forget the budget: time that passed while paused is not caught up with."""
+        self._budget = 0.0
+        self.capped = False
+
+
+class RateMeter:
+    """Steps and frames a second, averaged over half a second of wall time."""
+
+    def __init__(self, now: float):
+        self.steps_per_second = 0.0
+        self.frames_per_second = 0.0
+        self._start = now
+        self._steps = 0
+        self._frames = 0
+
+    def count(self, steps: int = 0, frames: int = 0) -> None:
+        self._steps += steps
+        self._frames += frames
+
+    def update(self, now: float) -> bool:
+        """Close the averaging window if it is full; return whether there are new rates."""
+        elapsed = now - self._start
+        if elapsed < _STATS_WINDOW_S:
+            return False
+        self.steps_per_second = self._steps / elapsed
+        self.frames_per_second = self._frames / elapsed
+        self._start = now
+        self._steps = self._frames = 0
+        return True
+
+    def restart(self, now: float) -> None:
+        """Forget what was counted, as after a pause."""
+        self._start = now
+        self._steps = self._frames = 0
+        self.steps_per_second = self.frames_per_second = 0.0
+
+
+# MERGED mjlab.viewer.base: What viewers, environments and policies expect of each other.
+
+
+class VerbosityLevel(enum.IntEnum):
+    """How much a viewer logs."""
+
+    SILENT = 0
+    INFO = 1
+    DEBUG = 2
+
+
+class EnvProtocol(Protocol):
+    """What a viewer needs of an environment, or of the wrapper a policy expects around it."""
+
+    @property
+    def cfg(self) -> ManagerBasedRlEnvCfg: ...
+
+    @property
+    def device(self) -> torch.device | str: ...
+
+    @property
+    def unwrapped(self) -> Any:
+        """The `ManagerBasedRlEnv` itself."""
+        ...
+
+    def get_observations(self) -> Any: ...
+
+    def reset(self) -> Any: ...
+
+    def step(self, actions: torch.Tensor) -> tuple[Any, ...]: ...
+
+    def close(self) -> None: ...
+
+
+class PolicyProtocol(Protocol):
+    """Anything that turns observations into actions (num_envs, num_actions).
+
+    A policy with memory also has a method `reset()`, called when the environments are reset. Where it
+    is `reset(dones=None)`, it is also called after every step, with `dones` (num_envs,) not 0 where an
+    episode ended.
+    """
+
+    def __call__(self, obs: torch.Tensor) -> torch.Tensor: ...
+
+
+def ended(results: tuple[Any, ...]) -> torch.Tensor:
+    """Return where an episode ended (num_envs,), from the four or five results of a step."""
+    return results[2] if len(results) == 4 else results[2] | results[3]
+
+
+def forget(policy: Any, dones: torch.Tensor) -> None:
+    """Let a policy with memory forget the environments in which `dones` (num_envs,) is not 0."""
+    reset = getattr(policy, "reset", None)
+    try:
+        knows_ends = callable(reset) and "dones" in inspect.signature(reset).parameters
+    except (TypeError, ValueError):
+        # Compiled functions do not say what they take.
+        return
+    if knows_ends:
+        reset(dones)
+
+
+class ViewerAction(enum.Enum):
+    """What a person can ask a viewer for."""
+
+    RESET = "reset"
+    TOGGLE_PAUSE = "toggle_pause"
+    SINGLE_STEP = "single_step"
+    RESET_SPEED = "reset_speed"
+    SPEED_UP = "speed_up"
+    SPEED_DOWN = "speed_down"
+    PREV_ENV = "prev_env"
+    NEXT_ENV = "next_env"
+    TOGGLE_PLOTS = "toggle_plots"
+    TOGGLE_DEBUG_VIS = "toggle_debug_vis"
+    TOGGLE_SHOW_ALL_ENVS = "toggle_show_all_envs"
+    FETCH_CHECKPOINT = "fetch_checkpoint"
+    CUSTOM = "custom"
+
+
+@dataclass
+class ViewerStatus:
+    """What a status display shows."""
+
+    paused: bool
+    step_count: int
+    """Environment steps since the viewer started or was last reset."""
+    speed_multiplier: float
+    speed_label: str
+    target_realtime: float
+    """Simulated seconds per wall second that were asked for."""
+    actual_realtime: float
+    """Simulated seconds per wall second that were reached."""
+    smoothed_fps: float
+    capped: bool
+    """Whether the machine is too slow for the target."""
+    last_error: str | None
+    """Last line of the error that paused the viewer."""
+
+
+# MERGED mjlab.viewer.base: Recent values of named terms, one point for every environment step.
+
+
+class TermHistory:
+    """Keeps the last `length` values of each term of a manager, for one environment."""
+
+    def __init__(self, length: int):
+        self.length = length
+        self._values: dict[str, deque[float]] = {}
+
+    @property
+    def names(self) -> list[str]:
+        return list(self._values)
+
+    def add(self, terms: Iterable[tuple[str, Sequence[float]]]) -> None:
+        """Append one point a term, as `get_active_iterable_terms(env_idx)` gives them.
+
+        A value that is not finite is recorded as NaN, which plots leave out.
+        """
+        for name, values in terms:
+            value = float(np.ravel(values)[0])
+            series = self._values.setdefault(name, deque(maxlen=self.length))
+            series.append(value if np.isfinite(value) else float("nan"))
+
+    def values(self, name: str) -> np.ndarray:
+        """Points of one term, (count,), the latest last."""
+        return np.array(self._values.get(name, ()), dtype=float)
+
+    def mean(self, name: str) -> float:
+        """Mean of the finite points; 0 without any."""
+        values = self.values(name)
+        finite = values[np.isfinite(values)]
+        return float(finite.mean()) if len(finite) else 0.0
+
+    def clear(self) -> None:
+        """Forget the points, keep the names."""
+        for series in self._values.values():
+            series.clear()
+
+
+# MERGED mjlab.viewer.base: Playing a policy without looking at it.
+
+
+@dataclass(frozen=True)
+class HeadlessResult:
+    """What happened in `run_headless`."""
+
+    num_steps: int
+    """Environment steps taken."""
+    mean_step_reward: float
+    """Reward a step, averaged over steps and environments."""
+    num_episodes: int
+    """Episodes that ended, over all environments."""
+
+
+def run_headless(
+    env: EnvProtocol,
+    policy: PolicyProtocol,
+    num_steps: int,
+    on_step: Callable[[int], None] | None = None,
+) -> HeadlessResult:
+    """Step `env` with `policy` as fast as it goes.
+
+    Args:
+        env: An environment, or the vector wrapper rsl_rl uses; its `step` returns four or five
+            things, of which the second is the reward (num_envs,).
+        policy: Maps observations to actions (num_envs, num_actions).
+        num_steps: Environment steps to take.
+        on_step: Called with the number of steps done, after each.
+
+    Raises:
+        ValueError: The number of steps is negative.
+    """
+    if num_steps < 0:
+        raise ValueError(f"num_steps is {num_steps}; it must be 0 or more.")
+    reward_sum = torch.zeros((), device=env.device, dtype=torch.float64)
+    episodes = torch.zeros((), device=env.device, dtype=torch.int64)
+    with torch.no_grad():
+        for step in range(num_steps):
+            result = env.step(policy(env.get_observations()))
+            reward_sum += result[1].double().mean()
+            done = ended(result)
+            forget(policy, done)
+            episodes += (done != 0).sum()
+            if on_step is not None:
+                on_step(step + 1)
+    return HeadlessResult(num_steps, float(reward_sum) / max(num_steps, 1), int(episodes))
+
 
 log = logging.getLogger(__name__)
 

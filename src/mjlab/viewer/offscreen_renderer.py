@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
+import os
+import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
+from unittest import mock
 
 import mujoco
 import numpy as np
 
-from mjlab.viewer.backdrop import has_sky, move_sun, paint_sky, prepare_sun
+from mjlab.utils import graphics
 from mjlab.viewer.camera import nearest_envs, resolve_camera
-from mjlab.viewer.gl_context import open_renderer
 from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS as VIEWER_MODEL_FIELDS
 from mjlab.viewer.model_sync import (
     compute_poses,
@@ -26,8 +29,179 @@ if TYPE_CHECKING:
     from mjlab.scene import Scene
     from mjlab.viewer.viewer_config import ViewerConfig
 
-log = logging.getLogger(__name__)
 
+# MERGED mjlab.viewer.offscreen_renderer: The one error that says: this machine cannot draw.
+
+_INSTALL_HINT = (
+    "To render without a display, install an EGL library and a driver "
+    "(`apt-get install libegl1 libgl1 libgl1-mesa-dri`), or install libosmesa6 "
+    "(`apt-get install libosmesa6`) and set MUJOCO_GL=osmesa."
+)
+
+# How PyOpenGL fails where there is no EGL: it looks for the function in a library that is None.
+_NO_EGL = "object has no attribute 'eglQueryString'"
+
+# How MuJoCo's renderer fails without a graphics library.
+_NO_CONTEXT = "has no attribute 'GLContext'"
+
+
+class RenderingUnavailableError(RuntimeError):
+    """Raised where an image or a window was asked for and this machine cannot draw one.
+
+    Its text is one line that says what failed and what to install, so that a caller can go on
+    without pictures: `except RenderingUnavailableError as error: log.warning("%s", error)`.
+    """
+
+    @classmethod
+    def offscreen(cls, cause: BaseException | str) -> RenderingUnavailableError:
+        """The error for an OpenGL context that could not be made, whatever the library said."""
+        if graphics.problem is not None:
+            return cls(f"Cannot render offscreen: {graphics.problem}. {_INSTALL_HINT}")
+        backend = os.environ.get("MUJOCO_GL") or "unset"
+        reason = " ".join(str(cause).split()) or type(cause).__name__
+        if _NO_EGL in reason:
+            reason = "no EGL library or driver was found"
+        elif _NO_CONTEXT in reason:
+            reason = "the variable switches rendering off"
+        return cls(
+            f"Cannot render offscreen (MUJOCO_GL={backend}): {reason.rstrip('.')}. {_INSTALL_HINT}"
+        )
+
+
+# MERGED mjlab.viewer.offscreen_renderer: Opening MuJoCo's offscreen renderer with a graphics library that needs no display.
+
+_MAX_GEOMS = 10_000
+_WITHOUT_DISPLAY = ("egl", "osmesa")
+
+
+def open_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+    """A renderer for images of (height, width) pixels.
+
+    MuJoCo chooses its graphics library when it is imported. A program that imports it before
+    mjlab gets one that needs a display; the library named by MUJOCO_GL (on Linux, egl where that
+    is not set) is used here all the same.
+
+    Raises:
+        RenderingUnavailableError: No image can be drawn, or none of that size; the text says what to
+            install or change.
+    """
+    # Where a library is missing, PyOpenGL and MuJoCo fail in a dozen ways (ImportError,
+    # AttributeError, FatalError, ...), some of them while being imported. All mean the same.
+    try:
+        return _open(model, height, width)
+    except Exception as error:
+        raise _explained(error, height, width) from error
+
+
+def _open(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+    wanted = os.environ.get("MUJOCO_GL", "").lower() or "egl"
+    if sys.platform != "linux" or wanted not in _WITHOUT_DISPLAY:
+        return mujoco.Renderer(model, height, width, max_geom=_MAX_GEOMS)
+    from mujoco.rendering.classic import gl_context
+
+    context = importlib.import_module(f"mujoco.{wanted}").GLContext
+    # MuJoCo has none if it was imported with MUJOCO_GL=disable.
+    with mock.patch.object(gl_context, "GLContext", context, create=True):
+        return mujoco.Renderer(model, height, width, max_geom=_MAX_GEOMS)
+
+
+def _explained(error: Exception, height: int, width: int) -> RenderingUnavailableError:
+    """Return the error for an image that cannot be drawn: is it the machine, or the size?"""
+    try:
+        small = _open(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8)
+    except Exception:
+        return RenderingUnavailableError.offscreen(error)
+    try:
+        from OpenGL import GL
+
+        limit = int(GL.glGetIntegerv(GL.GL_MAX_RENDERBUFFER_SIZE))
+        most = f" It draws at most {limit} x {limit}, if the memory is enough."
+    except Exception:
+        most = ""
+    finally:
+        small.close()
+    reason = " ".join(str(error).split())
+    return RenderingUnavailableError(
+        f"The graphics library of this machine cannot draw an image of {width} x {height} pixels "
+        f"({reason}).{most} Choose a smaller width or height; those of clips are "
+        "--video-width and --video-height."
+    )
+
+
+# MERGED mjlab.viewer.offscreen_renderer: What lies around the robot in rendered images: a sky, and sunlight where the camera looks.
+
+
+# The sky above, as a colour in [0, 1]; towards the horizon it becomes the haze of the model.
+_ZENITH = (0.35, 0.52, 0.70)
+
+# Least half width, in metres, of the square around the target in which sunlight casts shadows.
+_MIN_SHADOW_RANGE = 2.0
+_SUN_HEIGHT = 3.0
+
+
+def has_sky(model: mujoco.MjModel) -> bool:
+    """Whether the model brings a sky of its own."""
+    return bool((model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any())
+
+
+def paint_sky(pixels: np.ndarray, renderer: mujoco.Renderer) -> None:
+    """Paint a sky where the image that `renderer` has just drawn shows nothing.
+
+    Args:
+        pixels: The image, (height, width, 3), uint8, rows from the top; written in place.
+        renderer: The renderer, whose buffers still hold the image.
+    """
+    depth = np.empty(pixels.shape[:2], dtype=np.float32)
+    context = renderer._mjr_context
+    mujoco.mjr_readPixels(None, depth, renderer._rect, context)
+    # The buffer is read from the bottom.
+    zero_far = context.readDepthMap == mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+    nothing = depth[::-1] == (0.0 if zero_far else 1.0)
+    rows = np.flatnonzero(nothing.any(axis=1))
+    if len(rows) == 0:
+        return
+    horizon = np.asarray(renderer.model.vis.rgba.haze[:3], dtype=float)
+    share = np.linspace(0.0, 1.0, rows[-1] + 1)[:, None]
+    colors = (1.0 - share) * np.array(_ZENITH) + share * horizon
+    sky = np.zeros((len(pixels), 1, 3), dtype=np.uint8)
+    sky[: rows[-1] + 1, 0] = np.round(255.0 * colors)
+    # See-through shapes, such as ghosts, are drawn over black, and are not in the depths. How much of
+    # what is behind they let through is not known any more; half is what ghosts do.
+    through = nothing & pixels.any(axis=2)
+    tinted = np.minimum(pixels.astype(np.uint16) + sky // 2, 255)
+    np.copyto(pixels, sky, where=(nothing & ~through)[:, :, None])
+    np.copyto(pixels, tinted.astype(np.uint8), where=through[:, :, None])
+
+
+def prepare_sun(model: mujoco.MjModel, distance: float) -> None:
+    """Make directional lights one sun, whose shadows are near the camera's target, and fine.
+
+    A ground and a grid of terrain bring a light each, and under two everything would be white.
+
+    Args:
+        model: A private copy of the model, with its extent set.
+        distance: Distance from the camera to its target, in metres.
+    """
+    suns = np.flatnonzero(_is_directional(model))
+    model.light_diffuse[suns] /= max(len(suns), 1)
+    model.light_castshadow[suns[1:]] = False
+    model.vis.map.shadowclip = max(_MIN_SHADOW_RANGE, distance) / model.stat.extent
+
+
+def move_sun(model: mujoco.MjModel, data: mujoco.MjData, target: np.ndarray) -> None:
+    """Bring directional lights over `target` (3,), so that its shadow follows it.
+
+    Where such a light stands only decides where it casts shadows.
+    """
+    suns = _is_directional(model)
+    data.light_xpos[suns] = target - _SUN_HEIGHT * data.light_xdir[suns]
+
+
+def _is_directional(model: mujoco.MjModel) -> np.ndarray:
+    return model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+
+
+log = logging.getLogger(__name__)
 _MIN_EXTENT = 4.0
 _NO_PERTURBATION = mujoco.MjvPerturb()
 

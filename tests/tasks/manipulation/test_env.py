@@ -8,7 +8,7 @@ from lifting_tasks import DEPTH, LIFT, MULTI, lifting, move, task_cfg
 from scripted_arm import OPEN, SHUT, ScriptedArm
 
 from mjlab.envs import ManagerBasedRlEnv
-from mjlab.tasks.manipulation.success import at_goal, placed_at_goal, position_error
+from mjlab.tasks.manipulation.config.yam.rl_cfg import at_goal, placed_at_goal, position_error
 
 
 def in_front(cfg) -> None:

@@ -16,7 +16,7 @@ from lifting_tasks import MULTI, lifting
 from mjlab.entity import VariantEntityCfg
 from mjlab.tasks.manipulation.config.yam.env_cfgs import get_cube_spec
 from mjlab.tasks.manipulation.mdp import MultiCubeLiftingCommandCfg
-from mjlab.tasks.manipulation.mdp.placement import keep_apart
+from mjlab.tasks.manipulation.mdp.commands import keep_apart
 from mjlab.viewer.debug_visualizer import NullDebugVisualizer
 
 PoseRange = MultiCubeLiftingCommandCfg.ObjectPoseRangeCfg

@@ -10,7 +10,7 @@ import pytest
 from lifting_tasks import LIFT, MULTI
 
 from mjlab.asset_zoo.robots import get_yam_robot_cfg
-from mjlab.tasks.manipulation.mdp.reach import reach
+from mjlab.tasks.manipulation.mdp.commands import reach
 
 
 @pytest.fixture(scope="module")

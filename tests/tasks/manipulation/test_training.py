@@ -11,9 +11,9 @@ from lifting_tasks import DEPTH, LIFT, MULTI, RGB, lifting, task_cfg
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl import RslRlVecEnvWrapper
-from mjlab.rl.evaluate import evaluate_policy
+from mjlab.rl.evaluation import evaluate_policy
+from mjlab.tasks.manipulation.config.yam.rl_cfg import PLACEMENT, placed_at_goal
 from mjlab.tasks.manipulation.rl import ManipulationOnPolicyRunner
-from mjlab.tasks.manipulation.success import PLACEMENT, placed_at_goal
 from mjlab.tasks.registry import load_rl_cfg, load_runner_cls
 from mjlab.utils.random import seed_rng
 

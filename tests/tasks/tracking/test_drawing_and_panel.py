@@ -12,7 +12,7 @@ from tracking_tasks import task_cfg, unperturbed
 
 from mjlab.asset_zoo.robots import get_go1_robot_cfg
 from mjlab.envs import ManagerBasedRlEnv
-from mjlab.tasks.tracking.mdp.motion_drawing import ghost_model
+from mjlab.tasks.tracking.mdp.commands import ghost_model
 from mjlab.viewer.viser.viewer import ViserPlayViewer
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tracking_tasks import part_of
 
-from mjlab.tasks.tracking.mdp.motion_loader import MotionLoader
+from mjlab.tasks.tracking.mdp.motion_library import MotionLoader
 from mjlab.tasks.tracking.motion_file import (
     MotionFileError,
     check_motion_fits,

@@ -10,12 +10,10 @@ from types import SimpleNamespace
 import pytest
 from tracking_tasks import G1, part_of
 
-from mjlab.tasks.options import PolicyOrigin
-from mjlab.tasks.registry import load_env_cfg, load_options_cls
-from mjlab.tasks.tracking import wandb_motions
+from mjlab.tasks.registry import PolicyOrigin, load_env_cfg, load_options_cls
+from mjlab.tasks.tracking import motion_sources as wandb_motions
 from mjlab.tasks.tracking.motion_file import MotionFileError
-from mjlab.tasks.tracking.motion_record import record_motions
-from mjlab.tasks.tracking.motion_sources import find_motions, shipped_motions
+from mjlab.tasks.tracking.motion_sources import find_motions, record_motions, shipped_motions
 from mjlab.tasks.tracking.options import MotionOptions
 
 SQUAT, WALK = (shipped_motions()[name] for name in ("squat", "slow_walk"))

@@ -21,8 +21,7 @@ from mjlab.rl.onnx_policy import OnnxPolicyError, load_onnx_policy
 from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
 from mjlab.tasks.registry import load_rl_cfg, load_runner_cls
 from mjlab.tasks.tracking.motion_file import MotionFileError
-from mjlab.tasks.tracking.motion_record import record_motions, recorded_motions
-from mjlab.tasks.tracking.motion_sources import shipped_motions
+from mjlab.tasks.tracking.motion_sources import record_motions, recorded_motions, shipped_motions
 from mjlab.tasks.tracking.options import MotionOptions
 from mjlab.tasks.tracking.rl import MotionTrackingOnPolicyRunner
 

@@ -8,7 +8,7 @@ import pytest
 from velocity_tasks import GO1_ROUGH
 
 from mjlab.sensor import BuiltinSensorCfg, ObjRef
-from mjlab.tasks.velocity.variants import get_sensor, remove_sensors
+from mjlab.tasks.velocity.velocity_env_cfg import get_sensor, remove_sensors
 
 
 def params_of(cfg, term):

@@ -7,7 +7,7 @@ import torch
 from velocity_tasks import GO1_FLAT, GO1_ROUGH
 
 from mjlab.rl import RslRlVecEnvWrapper
-from mjlab.rl.evaluate import evaluate_policy, make_evaluation_env
+from mjlab.rl.evaluation import evaluate_policy, make_evaluation_env
 from mjlab.utils.noise import NoiseModelWithAdditiveBiasCfg
 
 

@@ -99,7 +99,7 @@ class Swings:
     """The term, with contacts and heights that a test sets step by step."""
 
     def __init__(self, monkeypatch: Any) -> None:
-        from mjlab.tasks.velocity.mdp import feet_rewards
+        from mjlab.tasks.velocity.mdp import rewards as feet_rewards
 
         self.contact = contacts(found=torch.ones(2, 2), landed=torch.zeros(2, 2).bool())
         self.scan = heights((0.0, 0.0), (0.0, 0.0))

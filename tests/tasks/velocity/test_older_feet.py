@@ -67,7 +67,7 @@ def test_neither_sensor_nor_sites_is_an_error(env):
 
 def test_swing_height_has_the_values_of_release_1_1(env, monkeypatch):
     from mjlab.compat import older_terms
-    from mjlab.tasks.velocity.mdp import feet_rewards
+    from mjlab.tasks.velocity.mdp import rewards as feet_rewards
 
     found = torch.tensor([[0, 1.0, 0], [0, 0, 1.0]])
     sensor = contacts(found=found, landed=torch.zeros(2, 3).bool())

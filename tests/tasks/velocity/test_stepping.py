@@ -12,8 +12,7 @@ from mjlab.envs import mdp as envs_mdp
 from mjlab.managers import ObservationGroupCfg, ObservationTermCfg
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.tasks.velocity import mdp
-from mjlab.tasks.velocity.mirror import mirror_of_joints
-from mjlab.tasks.velocity.symmetry import mirror_left_right
+from mjlab.tasks.velocity.symmetry import mirror_left_right, mirror_of_joints
 
 G1, GO1 = "Mjlab-Velocity-Flat-Unitree-G1", "Mjlab-Velocity-Flat-Unitree-Go1"
 

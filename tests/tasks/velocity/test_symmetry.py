@@ -17,8 +17,7 @@ from mjlab.scripts.train_run import parse_train_flags
 from mjlab.sensor import BuiltinSensorCfg, GridPatternCfg, ObjRef, RayCastSensorCfg
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.tasks.velocity import mdp
-from mjlab.tasks.velocity.mirror import mirror_of_joints
-from mjlab.tasks.velocity.symmetry import mirror_left_right
+from mjlab.tasks.velocity.symmetry import mirror_left_right, mirror_of_joints
 
 FLAT_GO1 = "Mjlab-Velocity-Flat-Unitree-Go1"
 ROUGH_GO1 = "Mjlab-Velocity-Rough-Unitree-Go1"

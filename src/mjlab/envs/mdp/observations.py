@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.compat import older_names
-from mjlab.envs.mdp._indexing import columns
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.sensor.builtin_sensor import BuiltinSensor
+from mjlab.utils.indexing import columns
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity

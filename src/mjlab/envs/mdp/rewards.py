@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.compat import older_names
-from mjlab.envs.mdp._indexing import columns
 from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.utils.indexing import columns
 from mjlab.utils.lab_api.string import resolve_matching_names_values
 
 if TYPE_CHECKING:

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from mjlab.envs.mdp._checks import check_contact_sensor
-from mjlab.managers.build_checks import checked_when_built
 from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.managers.term_checks import check_contact_sensor, checked_when_built
 from mjlab.utils.nan_guard import NanGuard
 
 if TYPE_CHECKING:

@@ -23,7 +23,6 @@ from mjlab.envs.mdp import (
     reset_joints_by_offset,
     time_out,
 )
-from mjlab.envs.mdp._indexing import columns
 from mjlab.managers import (
     EventTermCfg,
     ObservationGroupCfg,
@@ -41,6 +40,7 @@ from mjlab.rl.config import (
 from mjlab.scene import SceneCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
 from mjlab.terrains import TerrainEntityCfg
+from mjlab.utils.indexing import columns
 from mjlab.viewer import ViewerConfig
 
 if TYPE_CHECKING:

@@ -8,16 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjlab.tasks.options import PolicyOrigin, TaskOptions
-from mjlab.tasks.registry import load_env_cfg
+from mjlab.tasks.registry import PolicyOrigin, TaskOptions, load_env_cfg
 from mjlab.tasks.tracking.motion_file import MotionFileError
-from mjlab.tasks.tracking.motion_record import recorded_motions
-from mjlab.tasks.tracking.motion_sources import find_motions
-from mjlab.tasks.tracking.wandb_motions import fetch_artifact, fetch_motions_of_run
+from mjlab.tasks.tracking.motion_sources import (
+    fetch_artifact,
+    fetch_motions_of_run,
+    find_motions,
+    recorded_motions,
+)
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
-    from mjlab.tasks.tracking.mdp.motion_command import MotionCommandCfg
+    from mjlab.tasks.tracking.mdp.commands import MotionCommandCfg
 
 logger = logging.getLogger(__name__)
 
@@ -79,7 +81,7 @@ class MotionOptions(TaskOptions):
 
 def motion_cfg(env_cfg: Any) -> MotionCommandCfg:
     """Return the config of the motion command; raises `ValueError` if there is none."""
-    from mjlab.tasks.tracking.mdp.motion_command import MotionCommandCfg
+    from mjlab.tasks.tracking.mdp.commands import MotionCommandCfg
 
     for cfg in env_cfg.commands.values():
         if isinstance(cfg, MotionCommandCfg):

@@ -10,15 +10,15 @@ from typing import Any
 
 import torch
 
-from mjlab.envs.mdp._checks import require_sensor
-from mjlab.envs.mdp._indexing import columns
+from mjlab.managers.term_checks import require_sensor
 from mjlab.sensor import TerrainHeightSensor
-from mjlab.tasks.velocity.mdp.sensor_checks import (
+from mjlab.tasks.velocity.mdp.observations import (
     check_feet_sensor,
     check_same_feet,
     contact_columns,
     height_columns,
 )
+from mjlab.utils.indexing import columns
 from mjlab.utils.torch import constant_tensor
 
 _ROBOT = "robot"

@@ -4,81 +4,855 @@ Quaternions are (w, x, y, z) with the Hamilton product; angles are in radians; r
 axis times angle.
 """
 
-from mjlab.utils.lab_api._basics import (
-    copysign,
-    matrix_product,
-    normalize,
-    saturate,
-    scale_transform,
-    skew_symmetric_matrix,
-    unscale_transform,
-    wrap_to_pi,
-)
-from mjlab.utils.lab_api._conversions import (
-    convert_camera_frame_orientation_convention,
-    convert_quat,
-    create_rotation_matrix_from_view,
-    euler_xyz_from_quat,
-    matrix_from_euler,
-    matrix_from_quat,
-    quat_from_euler_xyz,
-    quat_from_matrix,
-)
-from mjlab.utils.lab_api._frames import (
-    apply_delta_pose,
-    combine_frame_transforms,
-    compute_pose_error,
-    is_identity_pose,
-    rigid_body_twist_transform,
-    subtract_frame_transforms,
-    transform_points,
-)
-from mjlab.utils.lab_api._poses import (
-    generate_random_rotation,
-    generate_random_transformation_matrix,
-    generate_random_translation,
-    interpolate_poses,
-    interpolate_rotations,
-    make_pose,
-    pose_in_A_to_pose_in_B,
-    pose_inv,
-    transform_poses_from_frame_A_to_frame_B,
-    unmake_pose,
-)
-from mjlab.utils.lab_api._projection import (
-    orthogonalize_perspective_depth,
-    project_points,
-    unproject_depth,
-)
-from mjlab.utils.lab_api._quaternions import (
-    axis_angle_from_quat,
-    quat_apply,
-    quat_apply_inverse,
-    quat_apply_yaw,
-    quat_box_minus,
-    quat_box_plus,
-    quat_conjugate,
-    quat_error_magnitude,
-    quat_from_angle_axis,
-    quat_inv,
-    quat_mul,
-    quat_rotate,
-    quat_rotate_inverse,
-    quat_slerp,
-    quat_unique,
-    yaw_quat,
-)
-from mjlab.utils.lab_api._sampling import (
-    default_orientation,
-    random_orientation,
-    random_yaw_orientation,
-    sample_cylinder,
-    sample_gaussian,
-    sample_log_uniform,
-    sample_ranges,
-    sample_triangle,
-    sample_uniform,
-)
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+import torch
+
+from mjlab.utils.torch import constant_tensor
+
+# MERGED mjlab.utils.lab_api.math: Scalars and vectors: ranges, angles, norms.
+
+
+def scale_transform(x: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
+    """Map [lower, upper] linearly to [-1, 1]."""
+    return 2.0 * (x - 0.5 * (lower + upper)) / (upper - lower)
+
+
+def unscale_transform(x: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
+    """Map [-1, 1] linearly to [lower, upper]."""
+    return 0.5 * x * (upper - lower) + 0.5 * (lower + upper)
+
+
+def saturate(x: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
+    """Limit `x` to [lower, upper], element by element."""
+    return torch.maximum(torch.minimum(x, upper), lower)
+
+
+def normalize(x: torch.Tensor, eps: float = 1e-9) -> torch.Tensor:
+    """Return the vectors on the last axis at unit length; those shorter than `eps` stay short."""
+    return x / torch.linalg.vector_norm(x, dim=-1, keepdim=True).clamp(min=eps)
+
+
+def wrap_to_pi(angles: torch.Tensor) -> torch.Tensor:
+    """Return the angles (rad) in [-pi, pi]: odd multiples of pi keep their sign."""
+    turned = torch.remainder(angles + torch.pi, 2.0 * torch.pi)
+    return torch.where((turned == 0) & (angles > 0), torch.pi, turned - torch.pi)
+
+
+def copysign(mag: float, other: torch.Tensor) -> torch.Tensor:
+    """Return numbers of size `mag` with the signs of `other`."""
+    return torch.copysign(torch.full_like(other, abs(mag)), other)
+
+
+def matrix_product(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    """Return the products (..., i, k) of small matrices (..., i, j) and (..., j, k).
+
+    They are sums, because a GPU may round the operands of `@` to TF32: 8 mm at 10 m.
+    """
+    return (first.unsqueeze(-1) * second.unsqueeze(-3)).sum(dim=-2)
+
+
+def skew_symmetric_matrix(vec: torch.Tensor) -> torch.Tensor:
+    """Return S with S u = vec x u; (..., 3) gives (..., 3, 3)."""
+    x, y, z = vec.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = (zero, -z, y, z, zero, -x, -y, x, zero)
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+# MERGED mjlab.utils.lab_api.math: Conversions between quaternions (w, x, y, z), matrices and Euler angles.
+
+ArrayT = TypeVar("ArrayT", torch.Tensor, np.ndarray)
+
+# A camera's axes (columns) in those of the OpenGL convention: there it looks along -z with +y up.
+_IN_OPENGL = {
+    "opengl": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    # Looks along +z, up is -y.
+    "ros": ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)),
+    # Looks along +x, up is +z.
+    "world": ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)),
+}
+
+
+def convert_quat(quat: ArrayT, to: Literal["xyzw", "wxyz"] = "xyzw") -> ArrayT:
+    """Reorder quaternions (..., 4) from (w, x, y, z) to (x, y, z, w), or back.
+
+    Raises `ValueError` for another target or last size.
+    """
+    if to not in ("xyzw", "wxyz"):
+        raise ValueError(f"to={to!r}; it must be 'xyzw' or 'wxyz'.")
+    if quat.shape[-1] != 4:
+        raise ValueError(f"Expected quaternions of shape (..., 4), got {tuple(quat.shape)}.")
+    shift = -1 if to == "xyzw" else 1
+    roll: Any = torch.roll if isinstance(quat, torch.Tensor) else np.roll
+    return roll(quat, shift, -1)
+
+
+def matrix_from_quat(quaternions: torch.Tensor) -> torch.Tensor:
+    """Return rotation matrices (..., 3, 3) of quaternions of any norm but zero."""
+    w, x, y, z = quaternions.unbind(-1)
+    s = 2.0 / quaternions.square().sum(dim=-1)
+    entries = (
+        1.0 - s * (y * y + z * z),
+        s * (x * y - z * w),
+        s * (x * z + y * w),
+        s * (x * y + z * w),
+        1.0 - s * (x * x + z * z),
+        s * (y * z - x * w),
+        s * (x * z - y * w),
+        s * (y * z + x * w),
+        1.0 - s * (x * x + y * y),
+    )
+    return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+
+
+def quat_from_matrix(matrix: torch.Tensor) -> torch.Tensor:
+    """Return the quaternions (..., 4) of rotation matrices (..., 3, 3).
+
+    The component of largest magnitude is positive (so w can be negative). Raises `ValueError` for
+    another shape.
+    """
+    if matrix.shape[-2:] != (3, 3):
+        raise ValueError(f"Expected matrices of shape (..., 3, 3), got {tuple(matrix.shape)}.")
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix.flatten(-2).unbind(-1)
+    # Row i of 4 q q' is 4 q_i q: any of them gives q, the one with the largest q_i most precisely.
+    products = torch.stack(
+        (
+            *(1.0 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01),
+            *(m21 - m12, 1.0 + m00 - m11 - m22, m10 + m01, m02 + m20),
+            *(m02 - m20, m10 + m01, 1.0 - m00 + m11 - m22, m12 + m21),
+            *(m10 - m01, m02 + m20, m12 + m21, 1.0 - m00 - m11 + m22),
+        ),
+        dim=-1,
+    ).unflatten(-1, (4, 4))
+    largest = products.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
+    index = largest[..., None, None].expand(*largest.shape, 1, 4)
+    return normalize(products.gather(-2, index).squeeze(-2))
+
+
+def quat_from_euler_xyz(roll: torch.Tensor, pitch: torch.Tensor, yaw: torch.Tensor) -> torch.Tensor:
+    """Return the quaternions (..., 4) of Rz(yaw) Ry(pitch) Rx(roll); angles (...) in rad."""
+    half = 0.5 * torch.stack(torch.broadcast_tensors(roll, pitch, yaw))
+    cr, cp, cy = torch.cos(half)
+    sr, sp, sy = torch.sin(half)
+    # Products of yaw and pitch.
+    cc, cs, sc, ss = cy * cp, cy * sp, sy * cp, sy * sp
+    return torch.stack(
+        (cc * cr + ss * sr, cc * sr - ss * cr, cs * cr + sc * sr, sc * cr - cs * sr), dim=-1
+    )
+
+
+def euler_xyz_from_quat(
+    quat: torch.Tensor, wrap_to_2pi: bool = False
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return roll, pitch and yaw (...) in rad, with R(quat) = Rz(yaw) Ry(pitch) Rx(roll).
+
+    Angles are in (-pi, pi], the pitch in [-pi/2, pi/2]; `wrap_to_2pi` gives [0, 2 pi).
+    """
+    w, x, y, z = quat.unbind(-1)
+    roll = torch.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = torch.asin((2.0 * (w * y - z * x)).clamp(-1.0, 1.0))
+    yaw = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    if wrap_to_2pi:
+        turn = 2.0 * torch.pi
+        return roll.remainder(turn), pitch.remainder(turn), yaw.remainder(turn)
+    return roll, pitch, yaw
+
+
+def matrix_from_euler(euler_angles: torch.Tensor, convention: str) -> torch.Tensor:
+    """Return the matrices (..., 3, 3) of rotations about the body's own axes, one after another.
+
+    Args:
+        euler_angles: (..., 3), rad.
+        convention: Three letters of X, Y and Z, neighbours different: "XYZ" is Rx Ry Rz.
+
+    Raises `ValueError` for another convention or last size.
+    """
+    if euler_angles.shape[-1] != 3:
+        raise ValueError(f"Expected angles of shape (..., 3), got {tuple(euler_angles.shape)}.")
+    is_valid = len(convention) == 3 and set(convention) <= set("XYZ")
+    if not is_valid or convention[1] in (convention[0], convention[2]):
+        raise ValueError(
+            f"The convention is {convention!r}; it must be three letters of X, Y and Z, no letter "
+            "twice in a row, as 'XYZ' or 'ZXZ'."
+        )
+    first, second, third = (
+        _axis_rotation(axis, angle)
+        for axis, angle in zip(convention, euler_angles.unbind(-1), strict=True)
+    )
+    return matrix_product(matrix_product(first, second), third)
+
+
+def _axis_rotation(axis: str, angle: torch.Tensor) -> torch.Tensor:
+    c, s = torch.cos(angle), torch.sin(angle)
+    one, zero = torch.ones_like(angle), torch.zeros_like(angle)
+    entries = {
+        "X": (one, zero, zero, zero, c, -s, zero, s, c),
+        "Y": (c, zero, s, zero, one, zero, -s, zero, c),
+        "Z": (c, -s, zero, s, c, zero, zero, zero, one),
+    }[axis]
+    return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+
+
+def convert_camera_frame_orientation_convention(
+    orientation: torch.Tensor,
+    origin: Literal["opengl", "ros", "world"] = "opengl",
+    target: Literal["opengl", "ros", "world"] = "ros",
+) -> torch.Tensor:
+    """Return the orientation (..., 4) of the same camera in another convention for its axes.
+
+    "opengl" looks along -z with +y up, "ros" along +z with -y up, "world" along +x with +z up.
+    Raises `ValueError` for another convention.
+    """
+    for name in (origin, target):
+        if name not in _IN_OPENGL:
+            raise ValueError(f"Unknown convention {name!r}; use one of {list(_IN_OPENGL)}.")
+    if origin == target:
+        return orientation.clone()
+    # Rows of the table are rows of matrices that take coordinates of a convention to OpenGL's.
+    from_origin = orientation.new_tensor(_IN_OPENGL[origin])
+    from_target = orientation.new_tensor(_IN_OPENGL[target])
+    turned = matrix_product(matrix_from_quat(orientation), from_origin.T)
+    return quat_from_matrix(matrix_product(turned, from_target))
+
+
+def create_rotation_matrix_from_view(
+    eyes: torch.Tensor,
+    targets: torch.Tensor,
+    up_axis: Literal["Y", "Z"] = "Z",
+    device: str = "cpu",
+) -> torch.Tensor:
+    """Return orientations (N, 3, 3) of cameras (OpenGL convention) at `eyes` looking at `targets`.
+
+    Args:
+        eyes: (N, 3).
+        targets: (N, 3).
+        up_axis: The axis of the world that points up in the image.
+        device: Where the result lies.
+
+    A camera that looks straight up or down takes the world's x axis as its right. Raises
+    `ValueError` for another `up_axis`.
+    """
+    if up_axis not in ("Y", "Z"):
+        raise ValueError(f"up_axis is {up_axis!r}; it must be 'Y' or 'Z'.")
+    backward = normalize((eyes - targets).to(device))
+    up = torch.zeros_like(backward)
+    up[..., "XYZ".index(up_axis)] = 1.0
+    right = torch.linalg.cross(up, backward)
+    is_vertical = torch.linalg.vector_norm(right, dim=-1, keepdim=True) < 1e-5
+    right = normalize(torch.where(is_vertical, right.new_tensor((1.0, 0.0, 0.0)), right))
+    return torch.stack((right, torch.linalg.cross(backward, right), backward), dim=-1)
+
+
+# MERGED mjlab.utils.lab_api.math: Quaternions (w, x, y, z) with the Hamilton product, on the last axis of a tensor.
+
+
+def quat_mul(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
+    """Return q1 * q2: rotate by q2, then by q1. `ValueError` unless the shapes are equal."""
+    if q1.shape != q2.shape:
+        raise ValueError(
+            f"quat_mul got shapes {tuple(q1.shape)} and {tuple(q2.shape)}; they must be equal "
+            "(expand one of them)."
+        )
+    # Each component of q1 times all of q2: 16 operations, where the components of the product, one
+    # by one, take 29.
+    product = q1[..., :1] * q2
+    w, x, y, z = (product[..., k] for k in range(4))
+    xw, xx, xy, xz = (q1[..., 1:2] * q2).unbind(-1)
+    w -= xx
+    x += xw
+    y -= xz
+    z += xy
+    yw, yx, yy, yz = (q1[..., 2:3] * q2).unbind(-1)
+    w -= yy
+    x += yz
+    y += yw
+    z -= yx
+    zw, zx, zy, zz = (q1[..., 3:] * q2).unbind(-1)
+    w -= zz
+    x -= zy
+    y += zx
+    z += zw
+    return product.contiguous()
+
+
+def quat_conjugate(q: torch.Tensor) -> torch.Tensor:
+    """Return (w, -x, -y, -z)."""
+    conjugate = -q
+    conjugate[..., 0] = q[..., 0]
+    return conjugate
+
+
+def quat_inv(q: torch.Tensor, eps: float = 1e-9) -> torch.Tensor:
+    """Return the inverse of quaternions of any norm: conjugate / max(norm^2, eps)."""
+    return quat_conjugate(q) / q.square().sum(dim=-1, keepdim=True).clamp(min=eps)
+
+
+def quat_unique(q: torch.Tensor) -> torch.Tensor:
+    """Return the quaternion of the same rotation with w >= 0."""
+    return torch.where(q[..., :1] < 0, -q, q)
+
+
+def quat_apply(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
+    """Rotate vectors: R(q) v.
+
+    Args:
+        quat: Unit quaternions, one for each vector or one for all; (..., 4).
+        vec: (..., 3).
+
+    Returns a tensor of the shape of `vec`. Raises `ValueError` if sizes do not fit.
+    """
+    return _rotate(_fit_to(quat, vec), vec, sign=1.0)
+
+
+def quat_apply_inverse(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
+    """Rotate vectors back: R(q)' v. Arguments and errors are those of `quat_apply`."""
+    return _rotate(_fit_to(quat, vec), vec, sign=-1.0)
+
+
+quat_rotate = quat_apply
+quat_rotate_inverse = quat_apply_inverse
+
+
+def quat_apply_yaw(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
+    """Rotate vectors by the yaw of the quaternions only."""
+    return quat_apply(yaw_quat(quat), vec)
+
+
+def yaw_quat(quat: torch.Tensor) -> torch.Tensor:
+    """Return the rotation about z by the yaw angle of the quaternions; (..., 4)."""
+    w, x, y, z = quat.unbind(-1)
+    half = 0.5 * torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    zero = torch.zeros_like(half)
+    return torch.stack((torch.cos(half), zero, zero, torch.sin(half)), dim=-1)
+
+
+def quat_from_angle_axis(angle: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:
+    """Return the rotation by `angle` (...) rad about `axis` (..., 3), normalized here."""
+    half = 0.5 * angle.unsqueeze(-1)
+    direction = normalize(axis)
+    vector = direction * torch.sin(half)
+    # Normalized again for the sake of axes of length zero.
+    return normalize(torch.cat((torch.cos(half).expand_as(vector[..., :1]), vector), dim=-1))
+
+
+def axis_angle_from_quat(quat: torch.Tensor, eps: float = 1.0e-6) -> torch.Tensor:
+    """Return the rotation vector, axis times angle in [0, pi]; (..., 3).
+
+    Half angles with a sine of at most `eps` use the series of angle / sin(angle / 2).
+    """
+    quat = quat_unique(quat)
+    real, vector = quat[..., :1], quat[..., 1:]
+    sine = torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
+    angle = 2.0 * torch.atan2(sine, real)
+    is_small = sine <= eps
+    # A divisor of 1 where the series is used keeps gradients finite.
+    ratio = angle / torch.where(is_small, 1.0, sine)
+    return vector * torch.where(is_small, 2.0 + angle.square() / 12.0, ratio)
+
+
+def quat_box_minus(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
+    """Return log(q1 * conj(q2)): the rotation vector, in world axes, that takes q2 to q1."""
+    return axis_angle_from_quat(quat_mul(q1, quat_conjugate(q2)))
+
+
+def quat_box_plus(q: torch.Tensor, delta: torch.Tensor, eps: float = 1.0e-6) -> torch.Tensor:
+    """Return exp(delta) * q: q rotated by the rotation vector `delta` (..., 3) in world axes.
+
+    Rotations by an angle of at most `eps` leave q unchanged.
+    """
+    angle = torch.linalg.vector_norm(delta, dim=-1)
+    turned = quat_mul(quat_from_angle_axis(angle, delta), q)
+    return torch.where(angle.unsqueeze(-1) > eps, turned, q)
+
+
+def quat_error_magnitude(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
+    """Return the angle between two orientations, unit quaternions, in [0, pi]; (...)."""
+    # Chords of the unit sphere are cheap, and precise for small angles: |q1 - q2| = 2 sin(angle / 4)
+    # and |q1 + q2| = 2 cos(angle / 4), or the other way round where one of them is to be negated.
+    away = torch.linalg.vector_norm(q1 - q2, dim=-1)
+    along = torch.linalg.vector_norm(q1 + q2, dim=-1)
+    return 4.0 * torch.atan2(torch.minimum(away, along), torch.maximum(away, along))
+
+
+def quat_slerp(q1: torch.Tensor, q2: torch.Tensor, tau: float) -> torch.Tensor:
+    """Interpolate the short way between two quaternions, (4,) each; tau 0 gives q1, 1 gives q2.
+
+    (Nearly) equal rotations give q1. The arguments are not changed. Raises `ValueError` for
+    other shapes.
+    """
+    if q1.shape != (4,) or q2.shape != (4,):
+        raise ValueError(
+            f"quat_slerp takes two quaternions of shape (4,), got {tuple(q1.shape)} and "
+            f"{tuple(q2.shape)}."
+        )
+    if tau == 0.0:
+        return q1.clone()
+    if tau == 1.0:
+        return q2.clone()
+    target = torch.where(torch.dot(q1, q2) < 0, -q2, q2)
+    # Precise for small angles too, where the arc cosine is not.
+    angle = 2.0 * torch.atan2((q1 - target).norm(), (q1 + target).norm())
+    sine = torch.sin(angle)
+    if sine <= 4.0 * torch.finfo(q1.dtype).eps:
+        return q1.clone()
+    return (torch.sin((1.0 - tau) * angle) * q1 + torch.sin(tau * angle) * target) / sine
+
+
+def _rotate(quat: torch.Tensor, vec: torch.Tensor, sign: float) -> torch.Tensor:
+    """Return v + 2 (s w c + xyz x c) with c = xyz x v; `sign` s is -1 for the inverse rotation."""
+    w, xyz = quat[..., :1], quat[..., 1:]
+    cross = torch.linalg.cross(xyz, vec)
+    change = torch.linalg.cross(xyz, cross).addcmul_(w, cross, value=sign)
+    return torch.add(vec, change, alpha=2.0)
+
+
+def _fit_to(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
+    """Return `quat` in a shape whose leading sizes broadcast to those of `vec`."""
+    if quat.shape[-1] == 4 and vec.shape[-1] == 3:
+        if quat.shape[:-1] == vec.shape[:-1]:
+            return quat
+        num_quats = quat.numel() // 4
+        if num_quats == 1:
+            return quat.reshape(*(1,) * (vec.dim() - 1), 4)
+        if num_quats == vec.numel() // 3:
+            return quat.reshape(*vec.shape[:-1], 4)
+        if quat.dim() == vec.dim() and all(
+            size in (1, wanted) for size, wanted in zip(quat.shape[:-1], vec.shape, strict=False)
+        ):
+            return quat
+    raise ValueError(
+        f"Cannot rotate vectors of shape {tuple(vec.shape)} by quaternions of shape "
+        f"{tuple(quat.shape)}; expected (..., 3) and (..., 4), one quaternion for each vector or "
+        "one for all."
+    )
+
+
+# MERGED mjlab.utils.lab_api.math: Poses as position (..., 3) and orientation (..., 4): combining, comparing, transforming.
+
+
+def combine_frame_transforms(
+    t01: torch.Tensor,
+    q01: torch.Tensor,
+    t12: torch.Tensor | None = None,
+    q12: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the pose of 2 in 0 from those of 1 in 0 and 2 in 1; None is zero or identity."""
+    t02 = t01 if t12 is None else t01 + quat_apply(q01, t12)
+    q02 = q01 if q12 is None else quat_mul(q01, q12)
+    return t02, q02
+
+
+def subtract_frame_transforms(
+    t01: torch.Tensor,
+    q01: torch.Tensor,
+    t02: torch.Tensor | None = None,
+    q02: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the pose of 2 in 1, from those of 1 and 2 in 0; None is zero or identity."""
+    t12 = quat_apply_inverse(q01, -t01 if t02 is None else t02 - t01)
+    q10 = quat_inv(q01)
+    return t12, q10 if q02 is None else quat_mul(q10, q02)
+
+
+def compute_pose_error(
+    t01: torch.Tensor,
+    q01: torch.Tensor,
+    t02: torch.Tensor,
+    q02: torch.Tensor,
+    rot_error_type: Literal["quat", "axis_angle"] = "axis_angle",
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return what takes pose 1 to pose 2: t02 - t01, and the rotation q02 * q01^-1.
+
+    The rotation is in world axes, as a rotation vector (..., 3) or a quaternion ("quat"). Raises
+    `ValueError` for another `rot_error_type`.
+    """
+    if rot_error_type not in ("quat", "axis_angle"):
+        raise ValueError(
+            f"rot_error_type is {rot_error_type!r}; it must be 'quat' or 'axis_angle'."
+        )
+    rotation = quat_mul(q02, quat_inv(q01))
+    if rot_error_type == "axis_angle":
+        rotation = axis_angle_from_quat(rotation)
+    return t02 - t01, rotation
+
+
+def apply_delta_pose(
+    source_pos: torch.Tensor,
+    source_rot: torch.Tensor,
+    delta_pose: torch.Tensor,
+    eps: float = 1.0e-6,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the pose moved by `delta_pose` (..., 6): a shift, then a rotation vector (world).
+
+    Rotations by an angle of at most `eps` leave the orientation unchanged.
+    """
+    return source_pos + delta_pose[..., :3], quat_box_plus(source_rot, delta_pose[..., 3:6], eps)
+
+
+def rigid_body_twist_transform(
+    v0: torch.Tensor, w0: torch.Tensor, t01: torch.Tensor, q01: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return linear and angular velocity of a rigid body in another frame fixed to it.
+
+    Args:
+        v0: Linear velocity of the origin of frame 0, in frame 0.
+        w0: Angular velocity, in frame 0.
+        t01: Position of frame 1 in frame 0.
+        q01: Orientation of frame 1 in frame 0.
+
+    Returns both for the origin of frame 1, in frame 1.
+    """
+    v1 = quat_apply_inverse(q01, v0 + torch.linalg.cross(w0, t01))
+    return v1, quat_apply_inverse(q01, w0)
+
+
+def transform_points(
+    points: torch.Tensor, pos: torch.Tensor | None = None, quat: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Return points given in a frame in the frame's surroundings: R(quat) point + pos.
+
+    Args:
+        points: (P, 3), or (N, P, 3).
+        pos: Position of the frame, (3,) or (N, 3); None for zero.
+        quat: Orientation of the frame, (4,) or (N, 4); None for identity.
+
+    Returns (P, 3), or (N, P, 3) where any argument has N.
+    """
+    is_batched = points.dim() == 3 or any(
+        part is not None and part.dim() == 2 for part in (pos, quat)
+    )
+    for part in (pos, quat):
+        if part is not None and part.dim() == 2 and points.dim() == 2:
+            points = points.expand(part.shape[0], *points.shape)
+    if quat is not None:
+        per_point = quat.unsqueeze(-2) if quat.dim() == 2 else quat
+        points = quat_apply(per_point.expand(*points.shape[:-1], 4), points)
+    if pos is not None:
+        points = points + (pos.unsqueeze(-2) if is_batched and pos.dim() == 2 else pos)
+    return points
+
+
+def is_identity_pose(pos: torch.Tensor, rot: torch.Tensor) -> bool:
+    """Return whether all poses, (..., 3) and (..., 4), are (nearly) the identity."""
+    no_shift = torch.allclose(pos, torch.zeros_like(pos))
+    # q and -q are the same rotation.
+    identity = torch.zeros_like(rot)
+    identity[..., 0] = 1.0
+    sign = torch.where(rot[..., :1] < 0, -1.0, 1.0)
+    return no_shift and torch.allclose(rot * sign, identity)
+
+
+# MERGED mjlab.utils.lab_api.math: Poses as homogeneous matrices (..., 4, 4): making, inverting, interpolating.
+
+
+def make_pose(pos: torch.Tensor, rot: torch.Tensor) -> torch.Tensor:
+    """Return poses (..., 4, 4) from positions (..., 3) and rotation matrices (..., 3, 3).
+
+    Raises `ValueError` if the leading sizes differ.
+    """
+    if pos.shape[:-1] != rot.shape[:-2] or pos.shape[-1] != 3 or rot.shape[-2:] != (3, 3):
+        raise ValueError(
+            f"make_pose got positions {tuple(pos.shape)} and rotations {tuple(rot.shape)}; "
+            "expected (..., 3) and (..., 3, 3) with equal leading sizes."
+        )
+    pose = torch.zeros(*pos.shape[:-1], 4, 4, dtype=pos.dtype, device=pos.device)
+    pose[..., :3, :3] = rot
+    pose[..., :3, 3] = pos
+    pose[..., 3, 3] = 1.0
+    return pose
+
+
+def unmake_pose(pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the positions (..., 3) and rotation matrices (..., 3, 3) of poses (..., 4, 4)."""
+    return pose[..., :3, 3], pose[..., :3, :3]
+
+
+def pose_inv(pose: torch.Tensor) -> torch.Tensor:
+    """Return the inverse of poses (..., 4, 4)."""
+    pos, rot = unmake_pose(pose)
+    back = rot.transpose(-1, -2)
+    return make_pose(-(back * pos.unsqueeze(-2)).sum(dim=-1), back)
+
+
+def pose_in_A_to_pose_in_B(pose_in_A: torch.Tensor, pose_A_in_B: torch.Tensor) -> torch.Tensor:
+    """Return a pose given in frame A in frame B, whose pose of A is `pose_A_in_B`."""
+    return matrix_product(pose_A_in_B, pose_in_A)
+
+
+def transform_poses_from_frame_A_to_frame_B(
+    src_poses: torch.Tensor, frame_A: torch.Tensor, frame_B: torch.Tensor
+) -> torch.Tensor:
+    """Return poses that stand to frame B as `src_poses` stand to frame A.
+
+    Args:
+        src_poses: (N, 4, 4), in the world.
+        frame_A: Pose of A in the world, (4, 4).
+        frame_B: Pose of B in the world, (4, 4).
+    """
+    return matrix_product(frame_B, matrix_product(pose_inv(frame_A), src_poses))
+
+
+def interpolate_rotations(
+    R1: torch.Tensor, R2: torch.Tensor, num_steps: int, axis_angle: bool = True
+) -> torch.Tensor:
+    """Return rotation matrices from R1 to R2 at equal steps, (num_steps + 1, 3, 3).
+
+    Args:
+        R1: First, (3, 3).
+        R2: Last, (3, 3).
+        num_steps: Number of steps.
+        axis_angle: Turn about one axis; False interpolates quaternions, which is the same path.
+
+    Raises `ValueError` for fewer than one step.
+    """
+    if num_steps < 1:
+        raise ValueError(f"num_steps is {num_steps}; it must be at least 1.")
+    fractions = [step / num_steps for step in range(num_steps)]
+    if axis_angle:
+        vector = axis_angle_from_quat(quat_from_matrix(matrix_product(R2, R1.transpose(-1, -2))))
+        angle = torch.linalg.vector_norm(vector) * R1.new_tensor(fractions)
+        turns = matrix_from_quat(quat_from_angle_axis(angle, vector.expand(num_steps, 3)))
+        steps = matrix_product(turns, R1)
+    else:
+        q1, q2 = quat_from_matrix(R1), quat_from_matrix(R2)
+        steps = matrix_from_quat(torch.stack([quat_slerp(q1, q2, tau) for tau in fractions]))
+    return torch.cat((steps, R2.unsqueeze(0)))
+
+
+def interpolate_poses(
+    pose_1: torch.Tensor,
+    pose_2: torch.Tensor,
+    num_steps: int | None = None,
+    step_size: float | None = None,
+    perturb: bool = False,
+) -> tuple[torch.Tensor, int]:
+    """Return both poses with poses between them, and the number of those between.
+
+    Args:
+        pose_1: First, (4, 4).
+        pose_2: Last, (4, 4).
+        num_steps: Number of poses between; or give
+        step_size: Largest distance (m) between positions, from which their number follows.
+        perturb: Shift the positions between at random along the path, by up to half a step.
+
+    Returns (number between + 2, 4, 4) and that number. Raises `ValueError` unless exactly one of
+    `num_steps` and `step_size` is given.
+    """
+    if (num_steps is None) == (step_size is None):
+        raise ValueError(
+            f"Give either num_steps or step_size (got num_steps={num_steps}, "
+            f"step_size={step_size})."
+        )
+    (pos_1, rot_1), (pos_2, rot_2) = unmake_pose(pose_1), unmake_pose(pose_2)
+    if num_steps is None:
+        num_steps = math.ceil(float(torch.linalg.vector_norm(pos_2 - pos_1)) / (step_size or 1.0))
+    intervals = num_steps + 1
+    grid = torch.arange(intervals + 1, dtype=pos_1.dtype, device=pos_1.device)
+    if perturb:
+        grid[1:-1] += torch.rand(num_steps, dtype=grid.dtype, device=grid.device) - 0.5
+    positions = pos_1 + (grid / intervals).unsqueeze(-1) * (pos_2 - pos_1)
+    return make_pose(positions, interpolate_rotations(rot_1, rot_2, intervals)), num_steps
+
+
+def generate_random_rotation(rot_boundary: float = 2 * math.pi) -> torch.Tensor:
+    """Return a rotation matrix (3, 3) from Euler angles uniform in [0, rot_boundary)."""
+    return matrix_from_euler(torch.rand(3, dtype=torch.float32) * rot_boundary, "XYZ")
+
+
+def generate_random_translation(pos_boundary: float = 1) -> torch.Tensor:
+    """Return a translation (3,), uniform in [-pos_boundary, pos_boundary)."""
+    return (torch.rand(3, dtype=torch.float32) * 2.0 - 1.0) * pos_boundary
+
+
+def generate_random_transformation_matrix(
+    pos_boundary: float = 1, rot_boundary: float = 2 * math.pi
+) -> torch.Tensor:
+    """Return a pose (4, 4) from a random translation and a random rotation, as above."""
+    return make_pose(
+        generate_random_translation(pos_boundary), generate_random_rotation(rot_boundary)
+    )
+
+
+# MERGED mjlab.utils.lab_api.math: Random numbers, points and orientations, drawn on the device asked for.
+
+Size = int | tuple[int, ...]
+
+
+def sample_uniform(
+    lower: torch.Tensor | float, upper: torch.Tensor | float, size: Size, device: str
+) -> torch.Tensor:
+    """Return numbers uniform in [lower, upper). The bounds may be tensors that broadcast."""
+    return torch.rand(_shape(size), dtype=torch.float32, device=device) * (upper - lower) + lower
+
+
+def sample_ranges(ranges: Iterable[tuple[float, float]], size: Size, device: str) -> torch.Tensor:
+    """Return numbers (*size, n), those of column i uniform in the i-th of n ranges [low, high)."""
+    low, high = (
+        constant_tensor(tuple(map(float, side)), device) for side in zip(*ranges, strict=True)
+    )
+    return sample_uniform(low, high, (*_shape(size), len(low)), device)
+
+
+def sample_log_uniform(
+    lower: torch.Tensor | float, upper: torch.Tensor | float, size: Size, device: str
+) -> torch.Tensor:
+    """Return numbers whose logarithm is uniform between those of the (positive) bounds."""
+    low = torch.as_tensor(lower, dtype=torch.float32, device=device).log()
+    high = torch.as_tensor(upper, dtype=torch.float32, device=device).log()
+    return torch.exp(sample_uniform(low, high, size, device))
+
+
+def sample_gaussian(
+    mean: torch.Tensor | float, std: torch.Tensor | float, size: Size, device: str
+) -> torch.Tensor:
+    """Return normally distributed numbers.
+
+    Where `mean` is a tensor, its shape is that of the result and `size` is not used.
+    """
+    shape = mean.shape if isinstance(mean, torch.Tensor) else _shape(size)
+    return torch.randn(shape, dtype=torch.float32, device=device) * std + mean
+
+
+def sample_triangle(lower: float, upper: float, size: Size, device: str) -> torch.Tensor:
+    """Return numbers of the triangular distribution on [lower, upper], densest in the middle."""
+    # The mean of two uniform numbers has this distribution.
+    mean = 0.5 * (
+        torch.rand(_shape(size), dtype=torch.float32, device=device)
+        + torch.rand(_shape(size), dtype=torch.float32, device=device)
+    )
+    return mean * (upper - lower) + lower
+
+
+def sample_cylinder(
+    radius: float, h_range: tuple[float, float], size: Size, device: str
+) -> torch.Tensor:
+    """Return points (*size, 3) uniform on the side of a cylinder about z; z in `h_range`."""
+    angle = sample_uniform(-torch.pi, torch.pi, size, device)
+    height = sample_uniform(h_range[0], h_range[1], size, device)
+    return torch.stack((radius * torch.cos(angle), radius * torch.sin(angle), height), dim=-1)
+
+
+def default_orientation(num: int, device: str) -> torch.Tensor:
+    """Return identity quaternions (num, 4)."""
+    quat = torch.zeros(num, 4, dtype=torch.float32, device=device)
+    quat[:, 0] = 1.0
+    return quat
+
+
+def random_orientation(num: int, device: str) -> torch.Tensor:
+    """Return quaternions (num, 4) uniform over all orientations."""
+    # The direction of a normally distributed vector is uniform on the sphere.
+    return normalize(torch.randn(num, 4, dtype=torch.float32, device=device))
+
+
+def random_yaw_orientation(num: int, device: str) -> torch.Tensor:
+    """Return quaternions (num, 4) of rotations about z, uniform in angle."""
+    zero = torch.zeros(num, dtype=torch.float32, device=device)
+    return quat_from_euler_xyz(zero, zero, sample_uniform(0.0, 2.0 * torch.pi, num, device))
+
+
+def _shape(size: Size) -> tuple[int, ...]:
+    return (size,) if isinstance(size, int) else tuple(size)
+
+
+# MERGED mjlab.utils.lab_api.math: Pinhole cameras: pixels and depths to points in the camera's frame, and back.
+#
+# The camera looks along +z with x to the right and y down. With the intrinsic matrix K, pixel (u, v)
+# at depth z is the point z K^-1 (u, v, 1). Pixels are counted from the upper left, u along a row.
+
+
+def project_points(points: torch.Tensor, intrinsics: torch.Tensor) -> torch.Tensor:
+    """Return pixel coordinates and depth (u, v, z) of points.
+
+    Args:
+        points: Points in the camera's frame, (P, 3) or (N, P, 3).
+        intrinsics: K, (3, 3) or (N, 3, 3).
+
+    Returns:
+        (N, P, 3), with N = 1 where neither has a batch dimension.
+
+    Raises:
+        ValueError: `points` has another number of dimensions.
+    """
+    if points.ndim not in (2, 3):
+        raise ValueError(f"points: expected (P, 3) or (N, P, 3), got {tuple(points.shape)}.")
+    # No matrix product, which a GPU may compute in TF32.
+    scaled = (intrinsics.unsqueeze(-3) * points.unsqueeze(-2)).sum(-1)
+    scaled = scaled if scaled.ndim == 3 else scaled.unsqueeze(0)
+    return torch.cat((scaled[..., :2] / scaled[..., 2:], scaled[..., 2:]), dim=-1)
+
+
+def unproject_depth(
+    depth: torch.Tensor, intrinsics: torch.Tensor, is_ortho: bool = True
+) -> torch.Tensor:
+    """Return the points of a depth image in the camera's frame, column by column of the image.
+
+    Args:
+        depth: (H, W), (H, W, 1), (N, H, W) or (N, H, W, 1).
+        intrinsics: K, (3, 3) or (N, 3, 3).
+        is_ortho: True for depths along the camera's z axis, False for distances from the camera.
+
+    Returns:
+        (W H, 3), or (N, W H, 3) where the image or K has a batch dimension; point u H + v is that of
+        pixel (u, v).
+
+    Raises:
+        ValueError: `depth` has another number of dimensions.
+    """
+    if not is_ortho:
+        depth = orthogonalize_perspective_depth(depth, intrinsics)
+    image = _without_channel(depth)
+    rays = _rays(image, intrinsics)
+    return (image.unsqueeze(-1) * rays).transpose(-3, -2).flatten(-3, -2)
+
+
+def orthogonalize_perspective_depth(depth: torch.Tensor, intrinsics: torch.Tensor) -> torch.Tensor:
+    """Return depths along the camera's z axis from distances to the camera.
+
+    Args:
+        depth: (H, W), (H, W, 1), (N, H, W) or (N, H, W, 1).
+        intrinsics: K, (3, 3) or (N, 3, 3).
+
+    Returns:
+        The shape of `depth`, with N in front where only K has a batch dimension.
+
+    Raises:
+        ValueError: `depth` has another number of dimensions.
+    """
+    image = _without_channel(depth)
+    result = image / torch.linalg.vector_norm(_rays(image, intrinsics), dim=-1)
+    return result if image is depth else result.unsqueeze(-1)
+
+
+def _without_channel(depth: torch.Tensor) -> torch.Tensor:
+    if depth.ndim not in (2, 3, 4) or (depth.ndim == 4 and depth.shape[-1] != 1):
+        raise ValueError(
+            "depth: expected (H, W), (H, W, 1), (N, H, W) or (N, H, W, 1), "
+            f"got {tuple(depth.shape)}."
+        )
+    has_channel = depth.ndim == 4 or (depth.ndim == 3 and depth.shape[-1] == 1)
+    return depth.squeeze(-1) if has_channel else depth
+
+
+def _rays(image: torch.Tensor, intrinsics: torch.Tensor) -> torch.Tensor:
+    """Return K^-1 (u, v, 1) of all pixels, (H, W, 3) or (N, H, W, 3)."""
+    height, width = image.shape[-2:]
+    v, u = torch.meshgrid(
+        torch.arange(height, device=image.device, dtype=image.dtype),
+        torch.arange(width, device=image.device, dtype=image.dtype),
+        indexing="ij",
+    )
+    k = intrinsics[..., None, None]  # (..., 3, 3, 1, 1)
+    y = (v - k[..., 1, 2, :, :]) / k[..., 1, 1, :, :]
+    x = (u - k[..., 0, 2, :, :] - k[..., 0, 1, :, :] * y) / k[..., 0, 0, :, :]
+    return torch.stack((x, y, torch.ones_like(x)), dim=-1)
+
 
 __all__ = [
     "apply_delta_pose",

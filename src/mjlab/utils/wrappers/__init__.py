@@ -1,3 +1,3 @@
 """Wrappers around an environment."""
 
-from mjlab.viewer.video_recorder import VideoRecorder as VideoRecorder
+from mjlab.utils.wrappers.video_recorder import VideoRecorder as VideoRecorder

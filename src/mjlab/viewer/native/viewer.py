@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import logging
+import math
+import os
+import sys
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
+import torch
 
-from mjlab.viewer.backdrop import move_sun, prepare_sun
-from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction
+from mjlab.viewer.base import BaseViewer, TermHistory, VerbosityLevel, ViewerAction
 from mjlab.viewer.camera import first_moving_body, nearest_envs, resolve_camera
-from mjlab.viewer.errors import RenderingUnavailableError
-from mjlab.viewer.history import TermHistory
 from mjlab.viewer.model_sync import VIEWER_INERTIAL_FIELDS as VIEWER_INERTIAL_FIELDS
 from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS as VIEWER_MODEL_FIELDS
 from mjlab.viewer.model_sync import (
@@ -24,22 +26,241 @@ from mjlab.viewer.model_sync import (
     sync_model_fields,
     to_numpy,
 )
-from mjlab.viewer.native.display import require_display
 from mjlab.viewer.native.keys import KEY_HELP, action_of_key
-from mjlab.viewer.native.perturbation import MousePush
-from mjlab.viewer.native.reward_plots import PlotCfg as PlotCfg
-from mjlab.viewer.native.reward_plots import compute_viewports as compute_viewports
-from mjlab.viewer.native.reward_plots import make_empty_figure as make_empty_figure
-from mjlab.viewer.native.reward_plots import reward_figures
 from mjlab.viewer.native.visualizer import MujocoNativeDebugVisualizer
+from mjlab.viewer.offscreen_renderer import RenderingUnavailableError, move_sun, prepare_sun
 
 if TYPE_CHECKING:
     import mujoco.viewer
 
     from mjlab.viewer.base import EnvProtocol, PolicyProtocol
 
-log = logging.getLogger(__name__)
 
+# MERGED mjlab.viewer.native.viewer: Whether this machine has a display to open a window on.
+
+
+def require_display() -> None:
+    """Check that a window can be opened.
+
+    Raises:
+        RenderingUnavailableError: There is no display. (GLFW itself would end the program.)
+    """
+    if sys.platform != "linux":
+        return
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise RenderingUnavailableError(
+            "MuJoCo's window needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set. "
+            "Use the browser viewer instead (--viewer viser)."
+        )
+    import glfw
+
+    if not glfw.init():
+        raise RenderingUnavailableError(
+            f"MuJoCo's window cannot open on DISPLAY={os.environ.get('DISPLAY')!r}: the display "
+            "server does not answer. Use the browser viewer instead (--viewer viser)."
+        )
+
+
+# MERGED mjlab.viewer.native.viewer: Pushing bodies with the mouse.
+
+
+class MousePush:
+    """Turns the window's mouse force into `qfrc_applied` of one environment.
+
+    Wrenches that tasks script stay in `xfrc_applied`, and generalised forces that a task wrote
+    itself are added to, not replaced: they are put back when the push ends.
+    """
+
+    def __init__(self, model: mujoco.MjModel):
+        self._model = model
+        self._env_idx: int | None = None
+        self._base: np.ndarray | None = None
+        self._written: np.ndarray | None = None
+
+    @property
+    def active(self) -> bool:
+        """Whether a force of the mouse stands in an environment."""
+        return self._env_idx is not None
+
+    def apply(
+        self, sim: Any, env_idx: int, data: mujoco.MjData, perturb: mujoco.MjvPerturb
+    ) -> None:
+        """Write the force of `perturb` for the next step; `data` holds the state it acts on."""
+        if not perturb.active or perturb.select <= 0:
+            self.release(sim)
+            return
+        force = self._generalised_force(data, perturb)
+        self._take_base(sim, env_idx)
+        assert self._base is not None
+        self._write(sim, env_idx, self._base + force)
+
+    def release(self, sim: Any) -> None:
+        """Take the push back; what the environment itself applies stays."""
+        if self._env_idx is None or self._base is None:
+            return
+        if self._is_ours(sim, self._env_idx):
+            self._write(sim, self._env_idx, self._base)
+        self._env_idx = self._base = self._written = None
+
+    def _take_base(self, sim: Any, env_idx: int) -> None:
+        if self._env_idx != env_idx:
+            self.release(sim)
+        # A reset or the task overwrote the row: what stands there now is the task's.
+        if self._base is None or not self._is_ours(sim, env_idx):
+            self._base = _row(sim, env_idx)
+        self._env_idx = env_idx
+
+    def _is_ours(self, sim: Any, env_idx: int) -> bool:
+        return self._written is not None and np.array_equal(_row(sim, env_idx), self._written)
+
+    def _write(self, sim: Any, env_idx: int, force: np.ndarray) -> None:
+        rows = sim.data.qfrc_applied
+        rows[env_idx] = torch.as_tensor(force, dtype=rows.dtype, device=rows.device)
+        self._written = _row(sim, env_idx)
+
+    def _generalised_force(self, data: mujoco.MjData, perturb: mujoco.MjvPerturb) -> np.ndarray:
+        scripted = data.xfrc_applied.copy()
+        data.xfrc_applied[:] = 0.0
+        mujoco.mjv_applyPerturbForce(self._model, data, perturb)
+        wrench = data.xfrc_applied[perturb.select].copy()
+        data.xfrc_applied[:] = scripted
+        force = np.zeros(self._model.nv)
+        point = data.xipos[perturb.select].copy()
+        mujoco.mj_applyFT(self._model, data, wrench[:3], wrench[3:], point, perturb.select, force)
+        return force
+
+
+def _row(sim: Any, env_idx: int) -> np.ndarray:
+    return to_numpy(sim.data.qfrc_applied[env_idx]).copy()
+
+
+# MERGED mjlab.viewer.native.viewer: Curves of the reward terms, drawn over the native window.
+
+
+@dataclass
+class PlotCfg:
+    """Reward plots of the native viewer."""
+
+    history: int = 300
+    """Number of environment steps shown."""
+    p_lo: float = 2.0
+    """Percentile of the values at the lower end of the y-range."""
+    p_hi: float = 98.0
+    """Percentile of the values at the upper end of the y-range."""
+    pad: float = 0.25
+    """Padding of the y-range at both ends, as a fraction of its span."""
+    min_span: float = 1e-6
+    """Smallest span of the y-range that is padded."""
+    init_yrange: tuple[float, float] = (-0.01, 0.01)
+    """Y-range of a term without values, or with zeros only."""
+    grid_size: tuple[int, int] = (3, 4)
+    """Number of grid lines along x and y."""
+    max_viewports: int = 12
+    """Number of terms plotted; the rest is left out."""
+    min_rows_per_col: int = 4
+    """Smallest number of rows a column is divided into."""
+    max_rows_per_col: int = 6
+    """Number of plots in a column before the next one begins."""
+    plot_strip_fraction: float = 1 / 3
+    """Fraction of the window's width that all columns together take."""
+    background_alpha: float = 0.5
+    """Opacity of the plots' black background."""
+
+
+def reward_figures(
+    history: TermHistory, viewport: mujoco.MjrRect, cfg: PlotCfg
+) -> list[tuple[mujoco.MjrRect, mujoco.MjvFigure]]:
+    """Return one figure per term and its place, for the first `cfg.max_viewports` terms."""
+    places = compute_viewports(len(history.names), viewport, cfg)
+    return [
+        (place, _figure(name, history.values(name), cfg))
+        for place, name in zip(places, history.names, strict=False)
+    ]
+
+
+def compute_viewports(num_plots: int, rect: mujoco.MjrRect, cfg: PlotCfg) -> list[mujoco.MjrRect]:
+    """Return the places of `num_plots` plots in `rect`: from the top, columns from the right."""
+    count = min(num_plots, cfg.max_viewports)
+    if count < 1:
+        return []
+    most_columns = math.ceil(cfg.max_viewports / cfg.max_rows_per_col)
+    columns = math.ceil(count / cfg.max_rows_per_col)
+    rows = max(math.ceil(count / columns), cfg.min_rows_per_col)
+    rows = min(rows, cfg.max_rows_per_col)
+    width = int(cfg.plot_strip_fraction * rect.width) // most_columns
+    height = rect.height // rows
+    right, top = rect.left + rect.width, rect.bottom + rect.height
+    cells = (divmod(index, rows) for index in range(count))
+    return [
+        mujoco.MjrRect(right - (column + 1) * width, top - (row + 1) * height, width, height)
+        for column, row in cells
+    ]
+
+
+def make_empty_figure(
+    title: str,
+    grid_size: tuple[int, int],
+    yrange: tuple[float, float],
+    history: int,
+    alpha: float,
+) -> mujoco.MjvFigure:
+    """Return a figure whose line 0 has `history` points at x = 0, -1, ... and y = 0.
+
+    Args:
+        title: Title of the figure.
+        grid_size: Number of grid lines along x and y.
+        yrange: Lowest and highest y shown.
+        history: Number of points, at most what MuJoCo has room for (1001).
+        alpha: Opacity of the black background.
+    """
+    figure = mujoco.MjvFigure()
+    mujoco.mjv_defaultFigure(figure)
+    figure.title = title
+    figure.gridsize[:] = grid_size
+    figure.range[1][:] = yrange
+    figure.figurergba[:] = (0.0, 0.0, 0.0, alpha)
+    count = min(history, figure.linedata.shape[1] // 2)
+    figure.linedata[0, 0 : 2 * count : 2] = -np.arange(count)
+    return figure
+
+
+def plot_scale(values: np.ndarray, cfg: PlotCfg) -> tuple[int, float, float]:
+    """Return the exponent of ten to divide a curve by, and its y-range.
+
+    The range spans the percentiles of `cfg`, padded. Curves whose magnitude is outside
+    [0.01, 1000) are scaled by a power of ten.
+    """
+    finite = values[np.isfinite(values)]
+    magnitude = float(np.abs(finite).max(initial=0.0))
+    if magnitude == 0.0:
+        return 0, *cfg.init_yrange
+    exponent = 0 if 0.01 <= magnitude < 1000.0 else math.floor(math.log10(magnitude))
+    low, high = np.percentile(finite / 10.0**exponent, [cfg.p_lo, cfg.p_hi])
+    # A flat curve gets a range too, wide enough for the labels of its axis to differ.
+    padding = cfg.pad * max(high - low, 0.4 * abs(high), 0.4 * abs(low), cfg.min_span)
+    return exponent, float(low - padding), float(high + padding)
+
+
+def _figure(name: str, values: np.ndarray, cfg: PlotCfg) -> mujoco.MjvFigure:
+    exponent, low, high = plot_scale(values, cfg)
+    title = name if exponent == 0 else f"{name} (1e{exponent})"
+    figure = make_empty_figure(title, cfg.grid_size, (low, high), cfg.history, cfg.background_alpha)
+    figure.flg_extend = 0
+    figure.linewidth = 2.0
+    figure.range[0][:] = (-cfg.history, 0)
+    figure.linergb[0][:] = (0.3, 0.8, 1.0)
+    # The points are x, y pairs in one row; values that are not finite leave a gap.
+    latest = values[-(figure.linedata.shape[1] // 2) :]
+    steps = np.arange(1 - len(latest), 1)
+    shown = np.isfinite(latest)
+    count = int(shown.sum())
+    figure.linepnt[0] = count
+    figure.linedata[0, 0 : 2 * count : 2] = steps[shown]
+    figure.linedata[0, 1 : 2 * count : 2] = np.clip(latest[shown] / 10.0**exponent, low, high)
+    return figure
+
+
+log = logging.getLogger(__name__)
 _MARKER_COLOR = (0.9, 0.1, 0.1, 0.9)
 _CLOSING_TIMEOUT_S = 5.0
 _NO_PERTURBATION = mujoco.MjvPerturb()

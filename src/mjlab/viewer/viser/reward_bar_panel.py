@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 
 import viser
 
-from mjlab.viewer.history import TermHistory
+from mjlab.viewer.base import TermHistory
 
 log = logging.getLogger(__name__)
 

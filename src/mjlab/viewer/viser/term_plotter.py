@@ -9,7 +9,7 @@ import numpy as np
 import viser
 from viser import uplot
 
-from mjlab.viewer.history import TermHistory
+from mjlab.viewer.base import TermHistory
 
 _SHOWN_AT_FIRST = 6
 _PLOT_HEIGHT = 120

@@ -17,7 +17,7 @@ from mjlab.actuator import BuiltinPositionActuatorCfg
 from mjlab.asset_zoo.robots import get_yam_robot_cfg
 from mjlab.entity import EntityCfg
 from mjlab.envs.mdp import DifferentialIKAction, DifferentialIKActionCfg
-from mjlab.utils.damped_least_squares import damped_least_squares
+from mjlab.envs.mdp.actions.differential_ik import damped_least_squares
 from mjlab.utils.lab_api.math import (
     compute_pose_error,
     quat_box_plus,

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mjlab.envs.mdp import dr
-from mjlab.envs.mdp.dr._selection import select
+from mjlab.envs.mdp.dr._core import select
 from mjlab.envs.mdp.dr._table import TABLE
 from mjlab.managers.event_manager import EventTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg

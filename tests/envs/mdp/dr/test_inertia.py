@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mjlab.envs.mdp import dr
-from mjlab.envs.mdp.dr.inertia import (
+from mjlab.envs.mdp.dr.body import (
     Inertial,
     inertial_from_pseudo_inertia,
     pseudo_inertia_matrix,

@@ -12,8 +12,8 @@ import torch
 from mjlab.actuator import BuiltinPositionActuatorCfg
 from mjlab.envs.mdp import dr, observations
 from mjlab.envs.mdp.actions import JointPositionActionCfg
+from mjlab.envs.mdp.dr._core import DOF, QPOS, Selection, select
 from mjlab.envs.mdp.dr._hooks import normalize_ball_joints
-from mjlab.envs.mdp.dr._selection import DOF, QPOS, Selection, select
 from mjlab.managers.event_manager import EventTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 

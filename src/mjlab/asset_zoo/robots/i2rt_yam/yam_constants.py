@@ -20,8 +20,8 @@ from pathlib import Path
 import mujoco
 
 from mjlab.actuator import BuiltinPositionActuatorCfg
-from mjlab.asset_zoo.robots._motors import DAMPING_RATIO as DAMPING_RATIO
-from mjlab.asset_zoo.robots._motors import action_scale, gains
+from mjlab.asset_zoo.robots.motors import DAMPING_RATIO as DAMPING_RATIO
+from mjlab.asset_zoo.robots.motors import action_scale, gains
 from mjlab.compat import older_names
 from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
 from mjlab.utils.actuator import ElectricActuator, reflect_rotary_to_linear

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import mujoco
 
-from mjlab.asset_zoo.robots._motors import DAMPING_RATIO as DAMPING_RATIO
-from mjlab.asset_zoo.robots._motors import NATURAL_FREQ as NATURAL_FREQ
-from mjlab.asset_zoo.robots._motors import action_scale, gains, position_actuator
+from mjlab.asset_zoo.robots.motors import DAMPING_RATIO as DAMPING_RATIO
+from mjlab.asset_zoo.robots.motors import NATURAL_FREQ as NATURAL_FREQ
+from mjlab.asset_zoo.robots.motors import action_scale, gains, position_actuator
 from mjlab.compat import older_names
 from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
 from mjlab.utils.actuator import ElectricActuator, reflected_inertia

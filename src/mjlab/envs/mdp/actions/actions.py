@@ -2,16 +2,172 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from mjlab.actuator.actuator import TransmissionType
-from mjlab.envs.mdp.actions.base import BaseAction as BaseAction
-from mjlab.envs.mdp.actions.base import BaseActionCfg as BaseActionCfg
-from mjlab.utils.substep import constant_within_step
+import torch
+
+from mjlab.actuator.actuator import TransmissionType, constant_within_step
+from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
+from mjlab.utils.indexing import columns
+from mjlab.utils.lab_api.string import resolve_matching_names, resolve_matching_names_values
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
+
+
+# MERGED mjlab.envs.mdp.actions.actions: What the action terms of actuator space share: targets, scale, offset and clip.
+
+
+@dataclass(kw_only=True)
+class BaseActionCfg(ActionTermCfg):
+    """Targets are `action * scale + offset`, then clipped."""
+
+    transmission_type: TransmissionType = TransmissionType.JOINT
+    """What the actuators drive: joints, tendons or sites. Subclasses fix it."""
+
+    actuator_names: tuple[str, ...] | list[str]
+    """Patterns of the driven joints (tendons, sites); each must match a whole name."""
+
+    scale: float | dict[str, float] = 1.0
+    """Factor of the action: one number, or pattern of target names to number (others 1)."""
+
+    offset: float | dict[str, float] = 0.0
+    """Added after scaling: one number, or pattern of target names to number (others 0)."""
+
+    preserve_order: bool = False
+    """True orders the action components by pattern, as given; False by the entity's own order."""
+
+
+class BaseAction(ActionTerm):
+    """Base of terms whose action has one component for each target.
+
+    Raises `ValueError` if a pattern (of targets, scale, offset or clip) matches nothing, or two
+    match one name; and if scale or offset are neither a number nor a dict.
+    """
+
+    cfg: BaseActionCfg
+
+    # What follows from the config is no run-time state: a resumed run may have another config.
+    # The entity saves its own.
+    _transient = {
+        "_entity",
+        "_target_ids",
+        "_target_names",
+        "_columns",
+        "_scale",
+        "_offset",
+        "_clip",
+    }
+
+    def __init__(self, cfg: BaseActionCfg, env: ManagerBasedRlEnv) -> None:
+        super().__init__(cfg, env)
+        ids, self._target_names = self._find_targets()
+        self._target_ids = torch.tensor(ids, dtype=torch.long, device=self.device)
+        # The same targets as a slice where they are contiguous, which reads without a copy.
+        self._columns = columns(ids, self.device)
+        self._raw_actions = torch.zeros(
+            self.num_envs, len(ids), dtype=torch.float32, device=self.device
+        )
+        self._processed_actions = torch.zeros_like(self._raw_actions)
+        self._scale = self._by_target("scale", cfg.scale, 1.0)
+        self._offset = self._by_target("offset", cfg.offset, 0.0)
+        self._clip = self._resolve_clip()
+
+    @property
+    def action_dim(self) -> int:
+        """Number of targets."""
+        return len(self._target_names)
+
+    @property
+    def raw_action(self) -> torch.Tensor:
+        """(N, action_dim) last action as the policy gave it; zero after a reset."""
+        return self._raw_actions
+
+    @property
+    def scale(self) -> torch.Tensor | float:
+        """Factor of the action: a number, or (N, action_dim)."""
+        return self._scale
+
+    @property
+    def offset(self) -> torch.Tensor | float:
+        """Added after scaling: a number, or (N, action_dim)."""
+        return self._offset
+
+    @property
+    def target_ids(self) -> torch.Tensor:
+        """Ids of the targets inside the entity, in the order of the action's components."""
+        return self._target_ids
+
+    @property
+    def target_names(self) -> list[str]:
+        """Names of the targets, in the order of the action's components."""
+        return self._target_names
+
+    def process_actions(self, actions: torch.Tensor) -> None:
+        """Scale, offset and clip `actions` (N, action_dim)."""
+        self._raw_actions.copy_(actions)
+        processed = self._processed_actions
+        torch.mul(self._raw_actions, self._scale, out=processed)
+        processed += self._offset
+        if self._clip is not None:
+            torch.clamp(processed, min=self._clip[..., 0], max=self._clip[..., 1], out=processed)
+
+    def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
+        """Zero the raw action of environments (None means all)."""
+        self._raw_actions[slice(None) if env_ids is None else env_ids] = 0.0
+
+    def _find_targets(self) -> tuple[list[int], list[str]]:
+        names, ordered = self.cfg.actuator_names, self.cfg.preserve_order
+        if self.cfg.transmission_type == TransmissionType.TENDON:
+            return self._entity.find_tendons(names, preserve_order=ordered)
+        if self.cfg.transmission_type == TransmissionType.SITE:
+            return self._entity.find_sites(names, preserve_order=ordered)
+        ids, joints = self._entity.find_joints_by_actuator_names(names)
+        if not ordered:
+            return ids, joints
+        positions, joints = resolve_matching_names(names, joints, preserve_order=True)
+        return [ids[position] for position in positions], joints
+
+    def _by_target(
+        self, what: str, value: float | dict[str, float], default: float
+    ) -> torch.Tensor | float:
+        if isinstance(value, (int, float)):
+            return float(value)
+        if not isinstance(value, dict):
+            raise ValueError(
+                f"{type(self.cfg).__name__}.{what} must be a number or a dict of name pattern to "
+                f"number, got {type(value).__name__}: {value!r}."
+            )
+        per_target = torch.full(
+            (self.action_dim,), default, dtype=torch.float32, device=self.device
+        )
+        ids, _, values = resolve_matching_names_values(value, self._target_names)
+        per_target[ids] = torch.tensor(values, dtype=torch.float, device=self.device)
+        return per_target.repeat(self.num_envs, 1)
+
+    def _resolve_clip(self) -> torch.Tensor | None:
+        """Return (N, action_dim, 2) bounds, infinite where none are given."""
+        if self.cfg.clip is None:
+            return None
+        if not isinstance(self.cfg.clip, dict):
+            raise ValueError(
+                f"{type(self.cfg).__name__}.clip must be a dict of name pattern to (low, high), "
+                f"got {type(self.cfg.clip).__name__}: {self.cfg.clip!r}."
+            )
+        bounds = torch.tensor([-torch.inf, torch.inf], dtype=torch.float32, device=self.device)
+        bounds = bounds.repeat(self.action_dim, 1)
+        ids, names, values = resolve_matching_names_values(self.cfg.clip, self._target_names)
+        for i, name, pair in zip(ids, names, values, strict=True):
+            bounds[i] = torch.tensor(_bounds(name, pair), dtype=torch.float32, device=self.device)
+        return bounds.repeat(self.num_envs, 1, 1)
+
+
+def _bounds(name: str, pair: Sequence[float]) -> tuple[float, float]:
+    if len(pair) != 2 or not pair[0] <= pair[1]:
+        raise ValueError(f"clip of target {name!r} must be (low, high) with low <= high: {pair!r}.")
+    return float(pair[0]), float(pair[1])
 
 
 @dataclass(kw_only=True)

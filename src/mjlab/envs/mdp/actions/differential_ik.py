@@ -10,28 +10,54 @@ from typing import TYPE_CHECKING, Literal, get_args
 import torch
 
 from mjlab.compat import accepts_older_fields, offers_older_attributes, older_names
-from mjlab.envs.mdp._indexing import columns
 from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
-from mjlab.utils.damped_least_squares import damped_least_squares
-from mjlab.utils.lab_api.math import (
-    compute_pose_error,
-    normalize,
-    quat_box_plus,
-    quat_from_matrix,
-)
+from mjlab.utils.indexing import columns
+from mjlab.utils.lab_api.math import compute_pose_error, normalize, quat_box_plus, quat_from_matrix
 from mjlab.utils.string import resolve_expr
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
-logger = logging.getLogger(__name__)
 
+# MERGED mjlab.envs.mdp.actions.differential_ik: Small regularized least-squares problems, one for each environment.
+
+
+def damped_least_squares(
+    jacobian: torch.Tensor, error: torch.Tensor, stiffness: torch.Tensor, pull: torch.Tensor
+) -> torch.Tensor:
+    """Return x = (J'J + D)^-1 (J'e + b), with D a diagonal of positive numbers.
+
+    It is computed as x = D^-1 (b + J'y) with (J D^-1 J' + I) y = e - J D^-1 b (the matrix inversion
+    lemma). That system has the size of the task, not of the arm, its eigenvalues are at least 1,
+    and for an arm that can move freely its condition does not depend on the damping, while that of
+    J'J + D grows with its inverse square: in single precision that fails from a damping of about
+    1e-3 downward. Singular poses still make it ill-conditioned, so it is solved in double
+    precision, which costs no more time here.
+
+    Args:
+        jacobian: J, (N, m, n). error: e, (N, m). stiffness: D, (N, n). pull: b, (N, n).
+
+    Returns (N, n), in the precision of `jacobian`.
+    """
+    j, e = jacobian.double(), error.double().unsqueeze(-1)
+    d, b = stiffness.double().unsqueeze(-1), pull.double().unsqueeze(-1)
+    scaled = j.mT / d
+    system = j @ scaled
+    system.diagonal(dim1=-2, dim2=-1).add_(1.0)
+    # Without a check of the outcome, which would wait for a GPU: the matrix is positive definite.
+    multiplier, _ = torch.linalg.solve_ex(system, e - j @ (b / d))
+    return (b / d + scaled @ multiplier).squeeze(-1).to(jacobian.dtype)
+
+
+logger = logging.getLogger(__name__)
 FrameType = Literal["body", "site", "geom"]
 
 # Least damping: below it a singular arm would have no solution.
 _MIN_DAMPING = 1.0e-6
+
 # A quaternion shorter than this names no orientation.
 _MIN_QUAT_NORM = 1.0e-6
+
 # No target is further away than this (m, rad); larger numbers would overflow.
 _FARTHEST = 1.0e6
 _WEIGHTS = ("position_weight", "orientation_weight", "joint_limit_weight", "posture_weight")

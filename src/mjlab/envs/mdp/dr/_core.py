@@ -2,28 +2,172 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
-from mjlab.envs.mdp.dr._selection import GEOM, ObjectKind, Selection, select
 from mjlab.envs.mdp.dr._types import (
     ABS,
     Distribution,
     Operation,
+    Ranges,
     draw,
     read_bounds,
     resolve_distribution,
     resolve_operation,
 )
-from mjlab.managers.event_manager import RecomputeLevel
+from mjlab.managers.event_manager import RecomputeLevel, requires_model_fields
+from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.utils.indexing import resolve_env_ids
 from mjlab.utils.lab_api.math import quat_from_euler_xyz, quat_mul
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import torch
+
+    from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.managers.scene_entity_config import SceneEntityCfg
+
+
+# MERGED mjlab.envs.mdp.dr._core: Which environments and which objects of an entity a randomization touches.
+
+
+# Numbers a joint contributes to qpos and to qvel, by mjtJoint: free, ball, slide, hinge.
+_QPOS_WIDTH = {0: 7, 1: 4, 2: 1, 3: 1}
+_DOF_WIDTH = {0: 6, 1: 3, 2: 1, 3: 1}
+
+
+@dataclass(frozen=True)
+class ObjectKind:
+    """A kind of MuJoCo object: where its ids are in configs, entities and the model."""
+
+    name: str
+    """What error messages call it."""
+    cfg_ids: str
+    """Attribute of `SceneEntityCfg` with the ids inside the entity."""
+    entity_names: str
+    """Attribute of `Entity` with the names, in the order of those ids."""
+    global_ids: str
+    """Attribute of `EntityIndexing` with the ids in the model, in that order too."""
+    start: str | None = None
+    """For values stored by address: the `MjModel` field with the first address of a joint."""
+    width: dict[int, int] | None = None
+    """For values stored by address: the number of addresses, by joint type."""
+
+
+BODY = ObjectKind("body", "body_ids", "body_names", "body_ids")
+GEOM = ObjectKind("geom", "geom_ids", "geom_names", "geom_ids")
+SITE = ObjectKind("site", "site_ids", "site_names", "site_ids")
+JOINT = ObjectKind("joint", "joint_ids", "joint_names", "joint_ids")
+DOF = ObjectKind("joint", "joint_ids", "joint_names", "joint_ids", "jnt_dofadr", _DOF_WIDTH)
+QPOS = ObjectKind("joint", "joint_ids", "joint_names", "joint_ids", "jnt_qposadr", _QPOS_WIDTH)
+TENDON = ObjectKind("tendon", "tendon_ids", "tendon_names", "tendon_ids")
+CAMERA = ObjectKind("camera", "camera_ids", "camera_names", "cam_ids")
+LIGHT = ObjectKind("light", "light_ids", "light_names", "light_ids")
+MATERIAL = ObjectKind("material", "material_ids", "material_names", "mat_ids")
+TEXTURE = ObjectKind("texture", "texture_ids", "texture_names", "tex_ids")
+PAIR = ObjectKind("pair", "pair_ids", "pair_names", "pair_ids")
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Rows (environments) and columns (places in a model field) to write."""
+
+    env: ManagerBasedRlEnv
+    entity: Entity
+    kind: ObjectKind
+    rows: torch.Tensor
+    """Environment ids, int64 (R,)."""
+    local_ids: torch.Tensor
+    """Ids of the objects inside the entity, int64 (K,)."""
+    columns: torch.Tensor
+    """Indices into the second dimension of the model field, int64 (C,). C = K, except where a
+    joint has several addresses."""
+
+    @property
+    def index(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Index of the block of rows and columns: (R, 1) and (1, C)."""
+        return self.rows[:, None], self.columns[None, :]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(R, C)."""
+        return len(self.rows), len(self.columns)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the selected objects."""
+        names = getattr(self.entity, self.kind.entity_names)
+        return [names[i] for i in self.local_ids.tolist()]
+
+
+def select(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor | None,
+    asset_cfg: SceneEntityCfg,
+    kind: ObjectKind,
+    pattern: str | None = None,
+) -> Selection:
+    """Resolve ids to a `Selection`.
+
+    Args:
+        env_ids: Environments; None means all.
+        asset_cfg: Entity and, without a pattern, its selected objects.
+        pattern: Regular expression that object names of the entity must match in full; it
+            replaces the selection of `asset_cfg`.
+
+    Raises `ValueError` if a pattern matches nothing.
+    """
+    entity: Entity = env.scene[asset_cfg.name]
+    all_ids: torch.Tensor = getattr(entity.data.indexing, kind.global_ids)
+    # Names are looked up for patterns only: randomization may run at nearly every step.
+    local_ids = (
+        _local_ids(getattr(asset_cfg, kind.cfg_ids), len(all_ids))
+        if pattern is None
+        else _matching_ids(pattern, getattr(entity, kind.entity_names), kind, asset_cfg.name)
+    )
+    ids = torch.tensor(local_ids, dtype=torch.long, device=env.device)
+    global_ids = all_ids[ids].long()
+    columns = global_ids if kind.start is None else _addresses(env, kind, global_ids)
+    return Selection(env, entity, kind, resolve_env_ids(env, env_ids), ids, columns)
+
+
+def _local_ids(ids: slice | int | Sequence[int] | torch.Tensor, count: int) -> list[int]:
+    if isinstance(ids, slice):
+        return list(range(count))[ids]
+    if isinstance(ids, torch.Tensor):
+        return ids.tolist()
+    return [ids] if isinstance(ids, int) else list(ids)
+
+
+def _matching_ids(pattern: str, names: Sequence[str], kind: ObjectKind, entity: str) -> list[int]:
+    ids = [i for i, name in enumerate(names) if re.fullmatch(pattern, name)]
+    if not ids:
+        raise ValueError(
+            f"ranges: the pattern {pattern!r} matches no {kind.name} of entity {entity!r}. "
+            f"Available: {list(names)}."
+        )
+    return ids
+
+
+def _addresses(env: ManagerBasedRlEnv, kind: ObjectKind, joints: torch.Tensor) -> torch.Tensor:
+    """Return every address of the joints: one of a hinge or slide, several of a ball joint."""
+    assert kind.start is not None
+    assert kind.width is not None
+    model = env.sim.mj_model
+    starts, types = getattr(model, kind.start), model.jnt_type
+    addresses = [
+        int(starts[joint]) + k
+        for joint in joints.tolist()
+        for k in range(kind.width[int(types[joint])])
+    ]
+    return torch.tensor(addresses, dtype=torch.long, device=env.device)
 
 
 @dataclass(frozen=True)
@@ -253,3 +397,146 @@ def _normalized(row: FieldRow, vectors: torch.Tensor) -> torch.Tensor:
             "Choose ranges that exclude the origin."
         )
     return vectors / norms
+
+
+# MERGED mjlab.envs.mdp.dr._core: Makes public functions, with real signatures and docstrings, from rows of the table.
+
+ROBOT = SceneEntityCfg("robot")
+"""Default selection of the functions: everything of the entity called "robot"."""
+_FIELD_ARGS = """
+Args:
+    env_ids: Environments to change; None means all.
+    ranges: Pair of numbers (tuple or list) for all target axes; or a dict of axis to pair; or a
+        dict of name pattern to either, where each pattern must match object names of the entity
+        in full and replaces the selection of `asset_cfg`.
+    asset_cfg: Entity and objects.
+    distribution: "uniform" (lower, upper), "log_uniform" (lower, upper), "gaussian" (mean,
+        standard deviation), or a `Distribution`.
+    operation: "abs" sets the sample, "scale" multiplies the compile-time default by it, "add"
+        adds it to the default; or an `Operation`.
+    axes: Axes of the field to change. Default: the keys of `ranges`, else {axes}.
+    shared_random: Draw one value per environment and axis for all objects.
+
+Raises:
+    ValueError: unknown name, pattern without match, bad range, or axis the field does not have.
+"""
+_ROTATION_ARGS = """
+Roll, pitch and yaw (rad) turn about the fixed x, y and z axes of the frame in which the
+orientation is given, starting from the default: repeating does not accumulate.
+
+Args:
+    env_ids: Environments to change; None means all.
+    roll_range, pitch_range, yaw_range: Pairs of numbers (rad), drawn per environment and object.
+    distribution: "uniform", "log_uniform", "gaussian", or a `Distribution`.
+    asset_cfg: Entity and objects.
+
+Raises:
+    ValueError: unknown distribution or bad range.
+"""
+
+
+class FieldTerm(Protocol):
+    """Signature of a function that randomizes a field."""
+
+    def __call__(
+        self,
+        env: ManagerBasedRlEnv,
+        env_ids: torch.Tensor | None,
+        ranges: Ranges,
+        asset_cfg: SceneEntityCfg = ...,
+        distribution: Distribution | str = ...,
+        operation: Operation | str = ...,
+        axes: list[int] | None = ...,
+        shared_random: bool = ...,
+    ) -> None: ...
+
+
+class RotationTerm(Protocol):
+    """Signature of a function that perturbs an orientation."""
+
+    def __call__(
+        self,
+        env: ManagerBasedRlEnv,
+        env_ids: torch.Tensor | None,
+        roll_range: tuple[float, float] = ...,
+        pitch_range: tuple[float, float] = ...,
+        yaw_range: tuple[float, float] = ...,
+        distribution: Distribution | str = ...,
+        asset_cfg: SceneEntityCfg = ...,
+    ) -> None: ...
+
+
+def field_term(name: str) -> FieldTerm:
+    """Return the function for the table's row `name`; call it in the module that publishes it."""
+    from mjlab.envs.mdp.dr._table import TABLE
+
+    row = TABLE[name]
+
+    @requires_model_fields(*row.fields, recompute=row.recompute)
+    def term(
+        env: ManagerBasedRlEnv,
+        env_ids: torch.Tensor | None,
+        ranges: Ranges,
+        asset_cfg: SceneEntityCfg = ROBOT,
+        distribution: Distribution | str = "uniform",
+        operation: Operation | str = row.operation,
+        axes: list[int] | None = None,
+        shared_random: bool = False,
+    ) -> None:
+        randomize(
+            row, env, env_ids, ranges, asset_cfg, distribution, operation, axes, shared_random
+        )
+
+    default_axes = "all" if row.default_axes is None else str(list(row.default_axes))
+    return _published(term, row, _FIELD_ARGS.format(axes=default_axes))
+
+
+def rotation_term(name: str) -> RotationTerm:
+    """Like `field_term`, for the rows that are quaternions."""
+    from mjlab.envs.mdp.dr._table import TABLE
+
+    row = TABLE[name]
+
+    @requires_model_fields(*row.fields, recompute=row.recompute)
+    def term(
+        env: ManagerBasedRlEnv,
+        env_ids: torch.Tensor | None,
+        roll_range: tuple[float, float] = (0.0, 0.0),
+        pitch_range: tuple[float, float] = (0.0, 0.0),
+        yaw_range: tuple[float, float] = (0.0, 0.0),
+        distribution: Distribution | str = "uniform",
+        asset_cfg: SceneEntityCfg = ROBOT,
+    ) -> None:
+        angles = (roll_range, pitch_range, yaw_range)
+        rotate(row, env, env_ids, angles, asset_cfg, distribution)
+
+    return _published(term, row, _ROTATION_ARGS)
+
+
+def _published(term: Any, row: FieldRow, arguments: str) -> Any:
+    """Give a made function the name, home and docstring it would have if written by hand."""
+    term.__name__ = term.__qualname__ = row.name
+    # Two frames up is the module that publishes the function: its home in configs and pickles.
+    term.__module__ = sys._getframe(2).f_globals["__name__"]
+    term.__doc__ = f"{row.summary}\n{arguments}"
+    return term
+
+
+# MERGED mjlab.envs.mdp.dr._core: Uniform choice among objects, for fields that hold ids.
+
+
+def choose_ids(targets: Selection, choices: Selection, shared_random: bool) -> torch.Tensor:
+    """Return model ids drawn from `choices`, int32, for each environment and target (R, C).
+
+    Raises `ValueError` if there is nothing to choose from.
+    """
+    kind, count = choices.kind.name, len(choices.columns)
+    if count == 0:
+        raise ValueError(
+            f"No {kind} to choose from: the selection of entity is empty. "
+            f"Set {kind}_names in the SceneEntityCfg to {kind}s that the entity has."
+        )
+    rows, columns = targets.shape
+    shape = (rows, 1 if shared_random else columns)
+    picks = torch.randint(count, shape, device=targets.env.device).expand(rows, columns)
+    return choices.columns[picks].int()

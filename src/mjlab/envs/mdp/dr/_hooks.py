@@ -11,7 +11,7 @@ import torch
 from mjlab.envs.mdp.dr._core import keep_absent, model_field
 
 if TYPE_CHECKING:
-    from mjlab.envs.mdp.dr._selection import Selection
+    from mjlab.envs.mdp.dr._core import Selection
 
 _PRIMITIVES = {
     int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",

@@ -6,8 +6,7 @@ Where a row has an alias (MuJoCo's own name of the field), both names are the sa
 from __future__ import annotations
 
 from mjlab.envs.mdp.dr import _hooks as hooks
-from mjlab.envs.mdp.dr._core import FieldRow
-from mjlab.envs.mdp.dr._selection import (
+from mjlab.envs.mdp.dr._core import (
     BODY,
     CAMERA,
     DOF,
@@ -19,6 +18,7 @@ from mjlab.envs.mdp.dr._selection import (
     QPOS,
     SITE,
     TENDON,
+    FieldRow,
 )
 from mjlab.managers.event_manager import RecomputeLevel
 

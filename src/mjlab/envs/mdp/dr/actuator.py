@@ -6,6 +6,7 @@ model, actuators computed outside MuJoCo in tensors of their own.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
@@ -24,26 +25,72 @@ from mjlab.actuator import (
 )
 from mjlab.actuator.actuator import TransmissionType
 from mjlab.compat import older_names
-from mjlab.envs.mdp._indexing import resolve_env_ids
-from mjlab.envs.mdp.dr._actuator_selection import SelectedActuator, selected_actuators
-from mjlab.envs.mdp.dr._core import model_field
-from mjlab.envs.mdp.dr._terms import ROBOT
+from mjlab.envs.mdp.dr._core import ROBOT, model_field
 from mjlab.envs.mdp.dr._types import (
     ABS,
     SCALE,
     Distribution,
     Operation,
+    draw,
     read_bounds,
     resolve_distribution,
     resolve_operation,
 )
 from mjlab.managers.event_manager import requires_model_fields
+from mjlab.utils.indexing import columns, resolve_env_ids
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from mjlab.actuator import Actuator
+    from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.envs.mdp.dr._types import Distribution
     from mjlab.managers.scene_entity_config import SceneEntityCfg
     from mjlab.utils.mujoco import CommandField
+
+
+# MERGED mjlab.envs.mdp.dr.actuator: Single actuators of an entity, found in the groups that the entity keeps them in.
+
+
+@dataclass(frozen=True)
+class SelectedActuator:
+    """The selected targets of one actuator object (one per actuator config)."""
+
+    entity: Entity
+    actuator: Actuator
+    rows: torch.Tensor
+    """Environment ids, (R,)."""
+    targets: torch.Tensor
+    """Positions of the selected targets inside the actuator, (K,)."""
+    elements: torch.Tensor
+    """Ids in the model of the MuJoCo actuators of these targets, (E, K); most kinds have E = 1."""
+
+    def draw(
+        self, distribution: Distribution, bounds: tuple[float, float], device: str
+    ) -> torch.Tensor:
+        """Draw one number per environment and target, (R, K)."""
+        return draw(distribution, bounds, (len(self.rows), len(self.targets)), device)
+
+
+def selected_actuators(
+    env: ManagerBasedRlEnv, rows: torch.Tensor, asset_cfg: SceneEntityCfg
+) -> Iterator[SelectedActuator]:
+    """Yield the actuator objects of an entity that own selected actuators.
+
+    `asset_cfg.actuator_ids` counts single actuators, as `actuator_names` does.
+    """
+    entity: Entity = env.scene[asset_cfg.name]
+    chosen = entity.data.indexing.actuator_ids[columns(asset_cfg.actuator_ids, env.device)]
+    for actuator in entity.actuators:
+        ids, count = actuator.global_element_ids, len(actuator.target_names)
+        # Kinds of a user's own may have another layout; who needs single elements refuses them.
+        elements = ids.reshape(-1, count) if len(ids) % count == 0 else ids[None, :]
+        is_chosen = torch.isin(elements, chosen.to(elements.dtype)).any(dim=0)
+        targets = is_chosen.nonzero().flatten()
+        if len(targets):
+            yield SelectedActuator(entity, actuator, rows, targets, elements[:, targets].long())
+
 
 __getattr__ = older_names(__name__)
 
@@ -69,14 +116,17 @@ _SERVO_GAINS = Gains(
     kp=(Place("actuator_gainprm", 0, 1.0), Place("actuator_biasprm", 1, -1.0)),
     kd=(Place("actuator_biasprm", 2, -1.0),),
 )
+
 # A velocity servo has no stiffness.
 _VELOCITY_GAINS = Gains(
     kp=(), kd=(Place("actuator_gainprm", 0, 1.0), Place("actuator_biasprm", 2, -1.0))
 )
+
 # A `<pid>` has its integral gain where a servo has the gain of its control.
 _PID_GAINS = Gains(
     kp=(Place("actuator_biasprm", 1, -1.0),), kd=(Place("actuator_biasprm", 2, -1.0),)
 )
+
 # Two MuJoCo actuators a target: the first follows the position, the second the velocity.
 _PD_GAINS = Gains(
     kp=(Place("actuator_gainprm", 0, 1.0, 0), Place("actuator_biasprm", 1, -1.0, 0)),
@@ -90,6 +140,7 @@ def _range_of(field: str) -> tuple[Place, ...]:
 
 _FORCE_RANGE = _range_of("actuator_forcerange")
 _MOTOR_RANGES = (*_FORCE_RANGE, *_range_of("actuator_ctrlrange"))
+
 # The peak force of a muscle, and the figure from which MuJoCo takes it where it is negative. Both
 # stand twice, for the active and the passive force.
 _MUSCLE_FORCE = tuple(
@@ -177,17 +228,17 @@ def effort_limits(
     bounds = read_bounds(effort_limit_range, "effort_limit_range")
     chosen = list(selected_actuators(env, resolve_env_ids(env, env_ids), asset_cfg))
     places = [_limit_places(env, selected) for selected in chosen]
-    for selected, (columns, targets) in zip(chosen, places, strict=True):
+    for selected, (controls, targets) in zip(chosen, places, strict=True):
         samples = selected.draw(dist, bounds, env.device)
         if isinstance(selected.actuator, IdealPdActuator):
             _set_ideal_limits(selected, op, samples)
         for place in targets:
-            values, at = samples, columns
+            values, at = samples, controls
             if place.field == "actuator_ctrlrange":
-                at = env.sim.get_default_field("actuator_ctrladr")[columns]
+                at = env.sim.get_default_field("actuator_ctrladr")[controls]
                 if op is ABS:
                     # Efforts are controls times the gain, which only motors of the XML have.
-                    gains = _default(env, selected.rows, columns, "actuator_gainprm", 0)
+                    gains = _default(env, selected.rows, controls, "actuator_gainprm", 0)
                     values = samples / gains.abs()
             _write(env, selected.rows, at, place, op, values)
 
@@ -261,7 +312,6 @@ _FORCE_LIMITED = (
     BuiltinVelocityActuator,
     XmlActuator,
 )
-
 
 # Kinds of activation that follow the control, so that its range limits the effort too.
 _FOLLOWING = (

@@ -2,9 +2,192 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+
 from mjlab.compat import older_names
-from mjlab.envs.mdp.dr._terms import field_term, rotation_term
-from mjlab.envs.mdp.dr.inertia import pseudo_inertia
+from mjlab.envs.mdp.dr._core import (
+    BODY,
+    ROBOT,
+    Selection,
+    default_values,
+    field_term,
+    model_field,
+    rotation_term,
+    select,
+)
+from mjlab.envs.mdp.dr._types import Distribution, draw, read_bounds, resolve_distribution
+from mjlab.managers.event_manager import RecomputeLevel, requires_model_fields
+from mjlab.utils.lab_api.math import matrix_from_quat, quat_from_matrix
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.managers.scene_entity_config import SceneEntityCfg
+
+
+# MERGED mjlab.envs.mdp.dr.body: Physically consistent randomization of mass, centre of mass and inertia together.
+
+_FIELDS = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
+
+
+class Inertial(NamedTuple):
+    """Inertial parameters of bodies, with leading dimensions (...), as MuJoCo stores them."""
+
+    mass: torch.Tensor
+    """(...) kg."""
+    com: torch.Tensor
+    """(..., 3) m, body frame."""
+    inertia: torch.Tensor
+    """(..., 3) kg m^2, principal moments."""
+    quat: torch.Tensor
+    """(..., 4) orientation of the principal axes in the body frame."""
+
+
+@requires_model_fields(*_FIELDS, recompute=RecomputeLevel.set_const)
+def pseudo_inertia(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor | None,
+    alpha_range: tuple[float, float] = (0.0, 0.0),
+    d_range: tuple[float, float] | None = None,
+    d1_range: tuple[float, float] = (0.0, 0.0),
+    d2_range: tuple[float, float] = (0.0, 0.0),
+    d3_range: tuple[float, float] = (0.0, 0.0),
+    s12_range: tuple[float, float] = (0.0, 0.0),
+    s13_range: tuple[float, float] = (0.0, 0.0),
+    s23_range: tuple[float, float] = (0.0, 0.0),
+    t_range: tuple[float, float] | None = None,
+    t1_range: tuple[float, float] = (0.0, 0.0),
+    t2_range: tuple[float, float] = (0.0, 0.0),
+    t3_range: tuple[float, float] = (0.0, 0.0),
+    distribution: Distribution | str = "uniform",
+    asset_cfg: SceneEntityCfg = ROBOT,
+) -> None:
+    """Randomize mass, centre of mass and inertia so that a real body could have them.
+
+    Every point of the default body moves by `x -> A x + t` in the body frame, and its density
+    scales, so that mass is multiplied by `e^(2 alpha)`:
+
+        A = [[e^d1, s12, s13], [0, e^d2, s23], [0, 0, e^d3]],   J' = e^(2 alpha) U J U^T,
+        U = [[A, t], [0, 1]],   J = pseudo-inertia matrix (4 x 4) of the default body.
+
+    The default is the start every time, so repeating does not accumulate. The principal moments
+    come out in ascending order. The ten parameters are drawn independently for each environment
+    and body, in the order alpha, d1..d3, s12, s13, s23, t1..t3.
+
+    Args:
+        env_ids: Environments to change; None means all.
+        alpha_range: Half the logarithm of the mass factor.
+        d1_range, d2_range, d3_range: Logarithms of the stretch along x, y, z.
+        d_range: Replaces the three single ranges.
+        s12_range, s13_range, s23_range: Shears.
+        t1_range, t2_range, t3_range: Shift of the centre of mass (m) in the body frame.
+        t_range: Replaces the three single ranges.
+        distribution: "uniform", "log_uniform", "gaussian", or a `Distribution`.
+        asset_cfg: Entity and bodies.
+
+    Raises:
+        ValueError: a selected body has no mass or an unphysical inertia (by name), or a bad range.
+    """
+    dist = resolve_distribution(distribution)
+    d_ranges = (d1_range, d2_range, d3_range) if d_range is None else (d_range,) * 3
+    t_ranges = (t1_range, t2_range, t3_range) if t_range is None else (t_range,) * 3
+    ranges = (alpha_range, *d_ranges, s12_range, s13_range, s23_range, *t_ranges)
+    bodies = select(env, env_ids, asset_cfg, BODY)
+    default = _default_pseudo_inertia(bodies)
+    parameters = [_draw(dist, bounds, bodies, k) for k, bounds in enumerate(ranges)]
+    transform = _transform(parameters)
+    perturbed = transform @ default @ transform.transpose(-1, -2)
+    new = inertial_from_pseudo_inertia(perturbed)
+    for field, value in zip(_FIELDS, new, strict=True):
+        model_field(env, field)[bodies.index] = value.float()
+
+
+_PARAMETERS = ("alpha", "d1", "d2", "d3", "s12", "s13", "s23", "t1", "t2", "t3")
+
+
+def _draw(dist: Distribution, bounds: Any, bodies: Selection, k: int) -> torch.Tensor:
+    pair = read_bounds(bounds, f"pseudo_inertia: {_PARAMETERS[k]}_range")
+    return draw(dist, pair, bodies.shape, bodies.env.device).double()
+
+
+def _default_pseudo_inertia(bodies: Selection) -> torch.Tensor:
+    values = Inertial(*(default_values(bodies, field).double() for field in _FIELDS))
+    # J is positive definite iff the mass and the second moments of mass along the principal axes
+    # are positive. The margin is the rounding of the float32 values: a flat body has none.
+    trace = values.inertia.sum(dim=-1, keepdim=True)
+    second_moments = 0.5 * trace - values.inertia
+    unphysical = (second_moments <= 2e-7 * trace).any(dim=-1) | (values.mass <= 0.0)
+    bad = unphysical.any(dim=0).tolist()
+    refused = [name for name, is_bad in zip(bodies.names, bad, strict=True) if is_bad]
+    if refused:
+        raise ValueError(
+            f"pseudo_inertia: the bodies {refused} have no mass, or an inertia that no real body "
+            "has (their pseudo-inertia matrix is not positive definite). Leave them out of "
+            "body_names, or give them a mass and an inertia in the model."
+        )
+    return pseudo_inertia_matrix(values)
+
+
+def _transform(parameters: list[torch.Tensor]) -> torch.Tensor:
+    """Return `e^alpha U` for parameters of shape (...), as (..., 4, 4)."""
+    alpha, d1, d2, d3, s12, s13, s23, t1, t2, t3 = parameters
+    zero, one = torch.zeros_like(alpha), torch.ones_like(alpha)
+    rows = (
+        (torch.exp(d1), s12, s13, t1),
+        (zero, torch.exp(d2), s23, t2),
+        (zero, zero, torch.exp(d3), t3),
+        (zero, zero, zero, one),
+    )
+    matrix = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    return torch.exp(alpha)[..., None, None] * matrix
+
+
+def pseudo_inertia_matrix(body: Inertial) -> torch.Tensor:
+    """Return J = [[Sigma, m c], [m c^T, m]], (..., 4, 4).
+
+    Sigma = tr(I_o) / 2 * 1 - I_o is the second moment of mass about the body frame's origin, and
+    I_o the inertia about that origin.
+    """
+    rotation = matrix_from_quat(body.quat)
+    about_com = rotation @ torch.diag_embed(body.inertia) @ rotation.transpose(-1, -2)
+    mass = body.mass[..., None, None]
+    about_origin = about_com + mass * _steiner(body.com)
+    sigma = 0.5 * _trace_identity(about_origin) - about_origin
+    moment = body.mass[..., None] * body.com
+    top = torch.cat((sigma, moment[..., None]), dim=-1)
+    bottom = torch.cat((moment, body.mass[..., None]), dim=-1)
+    return torch.cat((top, bottom[..., None, :]), dim=-2)
+
+
+def inertial_from_pseudo_inertia(matrix: torch.Tensor) -> Inertial:
+    """Return the inertial parameters of (..., 4, 4) pseudo-inertia matrices.
+
+    Principal moments are ascending; the axes are right-handed.
+    """
+    mass = matrix[..., 3, 3]
+    com = matrix[..., :3, 3] / mass[..., None]
+    sigma = matrix[..., :3, :3]
+    about_origin = _trace_identity(sigma) - sigma
+    about_com = about_origin - mass[..., None, None] * _steiner(com)
+    inertia, axes = torch.linalg.eigh(0.5 * (about_com + about_com.transpose(-1, -2)))
+    sign = torch.where(torch.linalg.det(axes) < 0.0, -1.0, 1.0).to(axes.dtype)
+    # Eigenvectors have no sign: turning the third makes them a rotation where they are none.
+    axes = torch.cat((axes[..., :2], axes[..., 2:] * sign[..., None, None]), dim=-1)
+    return Inertial(mass, com, inertia, quat_from_matrix(axes))
+
+
+def _steiner(com: torch.Tensor) -> torch.Tensor:
+    """Return |c|^2 1 - c c^T, the inertia of a unit mass at c about the origin."""
+    outer = com[..., :, None] * com[..., None, :]
+    return _trace_identity(outer) - outer
+
+
+def _trace_identity(matrix: torch.Tensor) -> torch.Tensor:
+    """Return tr(M) 1."""
+    trace = matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
+    return trace[..., None, None] * torch.eye(3, dtype=matrix.dtype, device=matrix.device)
+
 
 __all__ = [
     "body_com_offset",
@@ -14,7 +197,6 @@ __all__ = [
     "body_quat",
     "pseudo_inertia",
 ]
-
 body_com_offset = field_term("body_com_offset")
 body_mass = field_term("body_mass")
 body_pos = field_term("body_pos")
@@ -22,6 +204,4 @@ body_quat = rotation_term("body_quat")
 
 # MuJoCo's own name of the field.
 body_ipos = body_com_offset
-
-
 __getattr__ = older_names(__name__)

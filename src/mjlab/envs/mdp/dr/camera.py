@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mjlab.envs.mdp.dr._core import targets_of
+from mjlab.envs.mdp.dr._core import CAMERA, ROBOT, field_term, rotation_term, targets_of
 from mjlab.envs.mdp.dr._hooks import require_fovy_cameras
-from mjlab.envs.mdp.dr._selection import CAMERA
-from mjlab.envs.mdp.dr._terms import ROBOT, field_term, rotation_term
-from mjlab.managers.build_checks import checked_when_built
+from mjlab.managers.term_checks import checked_when_built
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mjlab.envs.mdp.dr._choice import choose_ids
-from mjlab.envs.mdp.dr._core import keep_absent, model_field
-from mjlab.envs.mdp.dr._selection import GEOM, MATERIAL, select
-from mjlab.envs.mdp.dr._terms import ROBOT, field_term, rotation_term
+from mjlab.envs.mdp.dr._core import (
+    GEOM,
+    MATERIAL,
+    ROBOT,
+    choose_ids,
+    field_term,
+    keep_absent,
+    model_field,
+    rotation_term,
+    select,
+)
 from mjlab.managers.event_manager import requires_model_fields
 
 if TYPE_CHECKING:

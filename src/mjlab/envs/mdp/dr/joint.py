@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mjlab.envs.mdp.dr._selection import JOINT, select
-from mjlab.envs.mdp.dr._terms import ROBOT, field_term
+from mjlab.envs.mdp.dr._core import JOINT, ROBOT, field_term, select
 from mjlab.envs.mdp.dr._types import draw, read_bounds, resolve_distribution
 
 if TYPE_CHECKING:

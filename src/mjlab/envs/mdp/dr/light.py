@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mjlab.envs.mdp.dr._terms import field_term
+from mjlab.envs.mdp.dr._core import field_term
 
 light_ambient = field_term("light_ambient")
 light_attenuation = field_term("light_attenuation")

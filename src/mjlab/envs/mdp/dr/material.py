@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mjlab.envs.mdp.dr._choice import choose_ids
-from mjlab.envs.mdp.dr._core import model_field
-from mjlab.envs.mdp.dr._selection import MATERIAL, TEXTURE, select
-from mjlab.envs.mdp.dr._terms import ROBOT, field_term
+from mjlab.envs.mdp.dr._core import (
+    MATERIAL,
+    ROBOT,
+    TEXTURE,
+    choose_ids,
+    field_term,
+    model_field,
+    select,
+)
 from mjlab.managers.event_manager import requires_model_fields
 
 if TYPE_CHECKING:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mjlab.envs.mdp.dr._core import model_field, randomize
+from mjlab.envs.mdp.dr._core import ROBOT, model_field, randomize
 from mjlab.envs.mdp.dr._table import TABLE
-from mjlab.envs.mdp.dr._terms import ROBOT
 from mjlab.managers.event_manager import requires_model_fields
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mjlab.envs.mdp.dr._terms import field_term
+from mjlab.envs.mdp.dr._core import field_term
 
 tendon_armature = field_term("tendon_armature")
 tendon_damping = field_term("tendon_damping")

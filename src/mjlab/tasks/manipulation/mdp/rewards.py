@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.compat import older_names
-from mjlab.envs.mdp._indexing import columns
-from mjlab.managers.build_checks import checked_when_built
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.tasks.manipulation.mdp._shared import (
+from mjlab.managers.term_checks import checked_when_built
+from mjlab.tasks.manipulation.mdp.observations import (
     check_multi,
     check_multi_with_hand,
     check_single,
@@ -23,6 +22,7 @@ from mjlab.tasks.manipulation.mdp._shared import (
     multi_cube_command,
     site_pos,
 )
+from mjlab.utils.indexing import columns
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity

@@ -1,6 +1,6 @@
 """The runner of the manipulation tasks."""
 
-from mjlab.rl.exporting_runner import ExportingOnPolicyRunner
+from mjlab.rl.runner import ExportingOnPolicyRunner
 
 
 class ManipulationOnPolicyRunner(ExportingOnPolicyRunner):

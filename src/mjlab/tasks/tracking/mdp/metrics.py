@@ -6,15 +6,17 @@ returns a value for each environment.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.tasks.tracking.mdp._shared import body_columns
+from mjlab.managers import TerminationTermCfg
+from mjlab.tasks.tracking.mdp.commands import MotionCommand, MotionCommandCfg, body_columns
+from mjlab.tasks.tracking.mdp.terminations import motion_ended
 from mjlab.utils.lab_api.math import quat_error_magnitude
 
 if TYPE_CHECKING:
-    from mjlab.tasks.tracking.mdp.motion_reader import MotionReader
+    from mjlab.tasks.tracking.mdp.motion_library import MotionReader
 
 
 def compute_mpkpe(command: MotionReader) -> torch.Tensor:
@@ -66,3 +68,79 @@ def compute_ee_orientation_error(
 
 def _distance(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
     return torch.linalg.vector_norm(one - other, dim=-1)
+
+
+# MERGED mjlab.tasks.tracking.mdp.metrics: What evaluations of motion tracking measure, and the environments that they measure it in.
+#
+# Every environment plays one motion once, from its first frame. Errors are those of the states in
+# which the policy acts, the perturbed start among them: each is compared with the frame of its own
+# time, and relative poses are those of the same time too. So no state after a reset is ever compared
+# with the frame before it.
+
+_COMMAND = "motion"
+_END_EFFECTORS = "ee_body_pos"
+_END = "motion_ended"
+_LONGER_THAN_MOTIONS_S = 3600.0
+
+
+def mpkpe(env: Any) -> torch.Tensor:
+    """Return the mean distance of the tracked bodies to the reference in the world (m), (N,)."""
+    return compute_mpkpe(_command(env).matching_frame)
+
+
+def r_mpkpe(env: Any) -> torch.Tensor:
+    """Return the same with the reference carried to the robot's place and heading (m), (N,)."""
+    return compute_root_relative_mpkpe(_command(env).matching_frame)
+
+
+def joint_vel_error(env: Any) -> torch.Tensor:
+    """Return the root mean square over joints of the velocity error (rad/s), (N,)."""
+    return compute_joint_velocity_error(_command(env).matching_frame)
+
+
+def ee_pos_error(env: Any) -> torch.Tensor:
+    """Return the mean distance of hands and feet to the relative reference (m), (N,)."""
+    return compute_ee_position_error(_command(env).matching_frame, _end_effectors(env))
+
+
+def ee_ori_error(env: Any) -> torch.Tensor:
+    """Return the mean angle of hands and feet to the relative reference (rad), (N,)."""
+    return compute_ee_orientation_error(_command(env).matching_frame, _end_effectors(env))
+
+
+TRACKING_ERRORS = {
+    "mpkpe": mpkpe,
+    "r_mpkpe": r_mpkpe,
+    "joint_vel_error": joint_vel_error,
+    "ee_pos_error": ee_pos_error,
+    "ee_ori_error": ee_ori_error,
+}
+"""The errors by the name under which evaluations report them."""
+
+
+def play_motions_once(cfg: Any) -> None:
+    """Edit an environment's config so that each episode is one motion, from its start to its end.
+
+    Nothing pushes. Noise, randomization and the perturbation of the start stay as they are. A motion
+    of more than an hour is cut.
+    """
+    motion = cfg.commands[_COMMAND]
+    assert isinstance(motion, MotionCommandCfg)
+    motion.sampling_mode = "start"
+    cfg.events.pop("push_robot", None)
+    cfg.terminations[_END] = TerminationTermCfg(
+        func=motion_ended, time_out=True, params={"command_name": _COMMAND}
+    )
+    # The motion is to end the episode, and not the clock. Which motion it will be is not known yet.
+    cfg.episode_length_s = max(cfg.episode_length_s, _LONGER_THAN_MOTIONS_S)
+
+
+def _command(env: Any) -> MotionCommand:
+    return env.command_manager.get_term(_COMMAND)
+
+
+def _end_effectors(env: Any) -> tuple[str, ...]:
+    manager = env.termination_manager
+    if _END_EFFECTORS not in manager.active_terms:
+        return ()
+    return tuple(manager.get_term_cfg(_END_EFFECTORS).params.get("body_names") or ())

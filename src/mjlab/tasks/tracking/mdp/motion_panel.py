@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.tasks.tracking.mdp.motion_reader import MotionFrame
+from mjlab.tasks.tracking.mdp.motion_library import MotionFrame
 from mjlab.utils.lab_api.math import quat_error_magnitude
 
 if TYPE_CHECKING:
     import viser
 
-    from mjlab.tasks.tracking.mdp.motion_command import MotionCommand
+    from mjlab.tasks.tracking.mdp.commands import MotionCommand
 
 _TABLE_PERIOD_S = 0.25
 _MAX_OFFSET = 2.0

@@ -11,7 +11,7 @@ import torch
 from mjlab.utils.state import stateful
 
 if TYPE_CHECKING:
-    from mjlab.tasks.tracking.mdp.motion_loader import MotionLibrary
+    from mjlab.tasks.tracking.mdp.motion_library import MotionLibrary
 
 Drawn = tuple[torch.Tensor, torch.Tensor]
 """Motions (n,) and frames within them (n,), int64."""

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.compat import older_names
-from mjlab.managers.build_checks import checked_when_built
-from mjlab.tasks.tracking.mdp._shared import check_motion_term, motion_command
+from mjlab.managers.term_checks import checked_when_built
+from mjlab.tasks.tracking.mdp.commands import check_motion_term, motion_command
 from mjlab.utils.lab_api.math import quat_apply_inverse, quat_conjugate, quat_mul
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.compat import older_names
-from mjlab.managers.build_checks import checked_when_built
-from mjlab.tasks.tracking.mdp._shared import body_columns, check_motion_term, motion_command
+from mjlab.managers.term_checks import checked_when_built
+from mjlab.tasks.tracking.mdp.commands import body_columns, check_motion_term, motion_command
 from mjlab.utils.lab_api.math import quat_apply_inverse as quat_apply_inverse
 
 if TYPE_CHECKING:

@@ -28,7 +28,7 @@ from scipy.linalg import solve_banded
 
 from mjlab.asset_zoo.robots import get_g1_robot_cfg
 from mjlab.tasks.tracking.motion_file import Motion, write_motion
-from mjlab.tasks.tracking.motion_kinematics import Recording, make_motion
+from mjlab.tasks.tracking.motion_recording import Recording, make_motion
 
 FPS = 50.0
 _GRAVITY = 9.81

@@ -9,7 +9,7 @@ from torch import nn
 
 from mjlab.envs import mdp
 from mjlab.rl.rsl import MLPModel
-from mjlab.tasks.tracking.mdp.motion_command import MotionCommand
+from mjlab.tasks.tracking.mdp.commands import MotionCommand
 
 _NEARLY_NOTHING = 0.01
 

@@ -14,7 +14,7 @@ from typing import Any
 from mjlab.scripts.cli import UserError, run_command, task_and_flags, task_usage
 from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
 from mjlab.scripts.policy import parse_policy_flags
-from mjlab.tasks.tracking.evaluation import TRACKING_ERRORS
+from mjlab.tasks.tracking.mdp.metrics import TRACKING_ERRORS
 
 _NAME = "python -m mjlab.tasks.tracking.scripts.evaluate"
 _USAGE = task_usage(

@@ -11,7 +11,7 @@ import copy
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import RslRlBaseRunnerCfg, RslRlOnPolicyRunnerCfg
 from mjlab.rl.learners import with_learner
-from mjlab.tasks.velocity.config.cpu_profile import cpu
+from mjlab.tasks.velocity.rl.ppo import cpu
 
 _STUDENT = "student"
 _SCAN = "height_scan"

@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import torch
 
 from mjlab.compat import older_names
-from mjlab.envs.mdp._checks import check_range, nearest, require_command
-from mjlab.managers.build_checks import checked_when_built
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.tasks.velocity.mdp._shared import velocity_command
-from mjlab.tasks.velocity.mdp.command_checks import RANGES
-from mjlab.tasks.velocity.mdp.velocity_command import UniformVelocityCommand
+from mjlab.managers.term_checks import check_range, checked_when_built, nearest, require_command
+from mjlab.tasks.velocity.mdp.rewards import velocity_command
+from mjlab.tasks.velocity.mdp.velocity_command import RANGES, UniformVelocityCommand
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity

@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import torch
 
-from mjlab.envs.mdp._checks import nearest, require_command, require_sensor
-from mjlab.envs.mdp._indexing import columns
-from mjlab.managers.build_checks import checked_when_built
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.managers.term_checks import checked_when_built, nearest, require_command, require_sensor
 from mjlab.sensor import TerrainHeightSensor
-from mjlab.tasks.velocity.mdp._shared import command_speed, values_of_joints
-from mjlab.tasks.velocity.mdp.sensor_checks import check_height_sensor
+from mjlab.tasks.velocity.mdp.observations import check_height_sensor
+from mjlab.tasks.velocity.mdp.rewards import command_speed, values_of_joints
+from mjlab.utils.indexing import columns
 from mjlab.utils.lab_api.math import quat_apply_inverse
 from mjlab.utils.torch import constant_tensor
 

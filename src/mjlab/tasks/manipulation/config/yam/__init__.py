@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _ENV_CFGS = "mjlab.tasks.manipulation.config.yam.env_cfgs"
 _RL_CFG = "mjlab.tasks.manipulation.config.yam.rl_cfg"
 _RUNNER = "mjlab.tasks.manipulation.rl"
-_PROFILES = "mjlab.tasks.manipulation.config.cpu_profile"
+_PROFILES = "mjlab.tasks.manipulation.config.yam.rl_cfg"
 
 # Task: config of the environment, config of the learner, profile.
 for _task, (_env, _rl, _profile) in {

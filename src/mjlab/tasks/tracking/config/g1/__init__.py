@@ -31,7 +31,7 @@ for _suffix, _env_cfg in (
         env_cfg=f"{_ENV_CFGS}:{_env_cfg}",
         rl_cfg=f"{_RL_CFG}:unitree_g1_tracking_ppo_runner_cfg",
         runner_cls=f"{_RUNNER}:MotionTrackingOnPolicyRunner",
-        profiles={"cpu": "mjlab.tasks.tracking.config.cpu_profile:cpu"},
+        profiles={"cpu": "mjlab.tasks.tracking.config.g1.rl_cfg:cpu"},
         options="mjlab.tasks.tracking.options:MotionOptions",
     )
 

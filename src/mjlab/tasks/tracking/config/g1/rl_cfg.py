@@ -2,13 +2,88 @@
 
 from __future__ import annotations
 
+import torch
+
+from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
+from mjlab.managers.curriculum_manager import CurriculumTermCfg
 from mjlab.rl.config import (
     EvaluationCfg,
     RslRlModelCfg,
     RslRlOnPolicyRunnerCfg,
     gaussian_distribution,
 )
-from mjlab.tasks.tracking.evaluation import TRACKING_ERRORS, play_motions_once
+from mjlab.tasks.cpu_profile import cpu_profile
+from mjlab.tasks.easing import Easing, Undo, ease_weight
+from mjlab.tasks.tracking.mdp.commands import motion_command
+from mjlab.tasks.tracking.mdp.metrics import TRACKING_ERRORS, play_motions_once
+
+# MERGED mjlab.tasks.tracking.config.g1.rl_cfg: The `cpu` profile: settings of motion tracking for a few cores.
+#
+# A few cores step some thousands of environments a second, a hundredth of a GPU. A humanoid with soft
+# drives falls within a second unless it balances, and that is what takes most of the learning. So the
+# profile makes the task easier to learn, not easier to pass:
+#
+# - Starts are perturbed, and robots pushed, by nothing at first and by as much as in the task later; the
+#   penalty for quick actions grows likewise.
+# - The physics takes two steps of 10 ms for a step of the environment, instead of four of 5 ms.
+# - The policy starts out as a position controller on the reference (`ReferenceActor`).
+# - Batches and networks are small, a policy may change more in an iteration, and rewards far away count
+#   less.
+#
+# Evaluations, `play` and `evaluate` undo the first two: what they show is the task as it is.
+
+_COMMAND = "motion"
+_ACTION_RATE = "action_rate_l2"
+_NUM_ENVS = 512
+_ACTION_RATE_AT_FIRST = 0.05
+_ACTION_RATE_SAMPLES = 6_000_000
+_CALM_SAMPLES = 4_000_000
+
+
+def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> Undo:
+    penalty = env_cfg.rewards[_ACTION_RATE]
+    if penalty is not None:
+        first = _ACTION_RATE_AT_FIRST * penalty.weight
+        ease_weight(env_cfg, _ACTION_RATE, first, _ACTION_RATE_SAMPLES // _NUM_ENVS)
+    params = {"command_name": _COMMAND, "steps": _CALM_SAMPLES // _NUM_ENVS}
+    env_cfg.curriculum["eased_starts"] = CurriculumTermCfg(func=GrowingStarts, params=params)
+    rl_cfg.actor.class_name = "mjlab.tasks.tracking.rl.reference_actor:ReferenceActor"
+    evaluation = rl_cfg.evaluation
+    evaluation.num_episodes = 200
+    evaluation.min_interval = 150
+    evaluation.solved_below = {"r_mpkpe": 0.05}
+    evaluation.solved_above = {"success_rate": 0.9}
+    return play_motions_once
+
+
+class GrowingStarts(Easing):
+    """Lets the perturbation of starts grow from nothing to what the command's config says.
+
+    Returns the fraction that it has reached.
+    """
+
+    def __call__(
+        self, env: ManagerBasedRlEnv, env_ids: torch.Tensor | slice, command_name: str, steps: int
+    ) -> float:
+        command = motion_command(env, command_name)
+        command.start_perturbation = self.fraction(steps)
+        return command.start_perturbation
+
+
+cpu = cpu_profile(
+    _ease,
+    num_envs=_NUM_ENVS,
+    hidden_dims=(256, 128),
+    init_std=0.8,
+    entropy_coef=0.005,
+    desired_kl=0.05,
+    gamma=0.98,
+    max_iterations=6000,
+    save_interval=200,
+    physics_steps=2,
+    unpushed_samples=12_000_000,
+)
+"""Profile of the tracking tasks."""
 
 
 def unitree_g1_tracking_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:

@@ -8,8 +8,12 @@ from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.managers import RewardTermCfg
 from mjlab.sensor import ContactMatch, ContactSensorCfg, ObjRef, RingPatternCfg
 from mjlab.tasks.velocity import mdp
-from mjlab.tasks.velocity.variants import get_sensor, make_flat, make_playable
-from mjlab.tasks.velocity.velocity_env_cfg import make_velocity_env_cfg
+from mjlab.tasks.velocity.velocity_env_cfg import (
+    get_sensor,
+    make_flat,
+    make_playable,
+    make_velocity_env_cfg,
+)
 
 _TORSO = "torso_link"
 # In the order of the model, as contacts and sites are.

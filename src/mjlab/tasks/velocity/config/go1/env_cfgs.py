@@ -10,13 +10,13 @@ from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.managers import EventTermCfg, RewardTermCfg, SceneEntityCfg, TerminationTermCfg
 from mjlab.sensor import ContactMatch, ContactSensorCfg, ObjRef, RingPatternCfg
 from mjlab.tasks.velocity import mdp
-from mjlab.tasks.velocity.variants import (
+from mjlab.tasks.velocity.velocity_env_cfg import (
     get_sensor,
     make_flat,
     make_playable,
+    make_velocity_env_cfg,
     remove_sensors,
 )
-from mjlab.tasks.velocity.velocity_env_cfg import make_velocity_env_cfg
 
 TerrainType = Literal["rough", "obstacles"]
 """Terrain of a task that does not walk on flat ground."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mjlab.rl.config import RslRlOnPolicyRunnerCfg
-from mjlab.tasks.velocity.config.ppo import velocity_ppo_runner_cfg
+from mjlab.tasks.velocity.rl.ppo import velocity_ppo_runner_cfg
 
 
 def unitree_go1_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:

@@ -1,0 +1,544 @@
+"""TODO."""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from mjlab.actuator import TransmissionType, XmlActuatorCfg
+from mjlab.actuator.xml_actuator import XML_TRANSMISSIONS
+from mjlab.utils.mujoco import control_inputs, qpos_width
+from mjlab.utils.string import resolve_expr
+
+if TYPE_CHECKING:
+    from mjlab.actuator import Actuator, ActuatorCfg
+    from mjlab.entity.entity import Entity, EntityCfg
+
+
+# MERGED mjlab.entity.building: The state an entity starts from: resolving the config, and the keyframe that shows it.
+
+KEY_NAME = "init_state"
+
+
+@dataclass(frozen=True)
+class XmlKey:
+    """The first keyframe of an entity's XML."""
+
+    name: str
+    qpos: tuple[float, ...]
+    ctrl: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class InitialState:
+    """The configured initial state, resolved for one entity's joints and actuators."""
+
+    root_state: tuple[float, ...]
+    """Position, quaternion, linear and angular velocity; only the pose with a fixed base."""
+    joint_pos: tuple[float, ...]
+    joint_vel: tuple[float, ...]
+    qpos: dict[mujoco.MjsJoint, tuple[float, ...]]
+    """The values of each joint, the free one included, in spec order."""
+    ctrl: dict[mujoco.MjsActuator, tuple[float, ...]]
+    """The controls of each actuator, in spec order."""
+
+
+def take_keys(spec: mujoco.MjSpec) -> XmlKey | None:
+    """Return the first keyframe of `spec`, and delete all of them.
+
+    A keyframe holds the whole of `qpos` and `ctrl`, so one made for the XML alone does not fit
+    once actuators are added. The scene gets a keyframe made from the resolved initial state.
+    """
+    keys = list(spec.keys)
+    if not keys:
+        return None
+    first = XmlKey(keys[0].name, tuple(keys[0].qpos), tuple(keys[0].ctrl))
+    if len(keys) > 1:
+        warnings.warn(
+            f"The spec {spec.modelname!r} has {len(keys)} keyframes: "
+            f"{[key.name for key in keys]}. Only the first is used, and only where "
+            "init_state.joint_pos is None; the others are dropped.",
+            UserWarning,
+            stacklevel=2,
+        )
+    for key in keys:
+        spec.delete(key)
+    return first
+
+
+def resolve_initial_state(
+    cfg: EntityCfg,
+    spec: mujoco.MjSpec,
+    free_joint: mujoco.MjsJoint | None,
+    joints: tuple[mujoco.MjsJoint, ...],
+    xml_key: XmlKey | None,
+) -> InitialState:
+    """Resolve `cfg.init_state` for the joints and actuators of `spec`.
+
+    Raises:
+        ValueError: a vector has the wrong length; `joint_pos` is None and the XML has no keyframe
+            that fits.
+    """
+    init = cfg.init_state
+    names = tuple(short_name(joint.name) for joint in joints)
+    pose = (*_vector(init.pos, 3, "pos"), *_vector(init.rot, 4, "rot"))
+    velocity = (*_vector(init.lin_vel, 3, "lin_vel"), *_vector(init.ang_vel, 3, "ang_vel"))
+    joint_vel = _floats(resolve_expr(init.joint_vel, names, 0.0))
+    if init.joint_pos is None:
+        joint_pos = _joint_pos_of_key(xml_key, spec, joints)
+    else:
+        joint_pos = _floats(resolve_expr(init.joint_pos, names, 0.0))
+    values: dict[mujoco.MjsJoint, tuple[float, ...]] = {
+        joint: (value,) for joint, value in zip(joints, joint_pos, strict=True)
+    }
+    if free_joint is not None:
+        values[free_joint] = pose
+    return InitialState(
+        root_state=pose if free_joint is None else (*pose, *velocity),
+        joint_pos=joint_pos,
+        joint_vel=joint_vel,
+        qpos={joint: values[joint] for joint in spec.joints},
+        ctrl=_ctrl(spec, joints, joint_pos, xml_key if init.joint_pos is None else None),
+    )
+
+
+def add_key(spec: mujoco.MjSpec, states: list[InitialState]) -> None:
+    """Add the keyframe `init_state` to `spec`, which holds the elements of `states`.
+
+    Joints and actuators that belong to no entity take the model's own reference and zero.
+    """
+    known_joints = {joint: v for state in states for joint, v in state.qpos.items()}
+    known_ctrl = {actuator: u for state in states for actuator, u in state.ctrl.items()}
+    qpos: list[float] = []
+    for joint in spec.joints:
+        values = known_joints.get(joint)
+        qpos.extend(_reference(joint) if values is None else values)
+    ctrl = [
+        value
+        for actuator in spec.actuators
+        for value in known_ctrl.get(actuator) or (0.0,) * len(control_inputs(actuator))
+    ]
+    spec.add_key(name=KEY_NAME, qpos=qpos, ctrl=ctrl)
+
+
+def short_name(name: str) -> str:
+    """Return the part of an element's name after the last '/', which is its name in its entity.
+
+    Names that merged variants give to geoms are kept whole: their last part is but a number.
+    """
+    _, merged, rest = name.partition("mjlab/pad/")
+    return merged + rest if merged else name.rsplit("/", 1)[-1]
+
+
+def _reference(joint: mujoco.MjsJoint) -> list[float]:
+    """Return what the compiler puts into `qpos0` for a joint."""
+    if joint.type == mujoco.mjtJoint.mjJNT_FREE:
+        return [*joint.parent.pos, *joint.parent.quat]
+    if joint.type == mujoco.mjtJoint.mjJNT_BALL:
+        return [1.0, 0.0, 0.0, 0.0]
+    in_degrees = joint.type == mujoco.mjtJoint.mjJNT_HINGE and joint.compiler.degree
+    return [math.radians(joint.ref) if in_degrees else float(joint.ref)]
+
+
+def _ctrl(
+    spec: mujoco.MjSpec,
+    joints: tuple[mujoco.MjsJoint, ...],
+    joint_pos: tuple[float, ...],
+    key: XmlKey | None,
+) -> dict[mujoco.MjsActuator, tuple[float, ...]]:
+    """Return the controls that hold the joints at `joint_pos`, or those of a keyframe."""
+    positions = {joint.name: value for joint, value in zip(joints, joint_pos, strict=True)}
+    known = key.ctrl if key is not None else ()
+    ctrl, start = {}, 0
+    for actuator in spec.actuators:
+        inputs = control_inputs(actuator)
+        stop = start + len(inputs)
+        # The actuators that the XML itself has come first, in the order of its keyframe.
+        if stop <= len(known):
+            ctrl[actuator] = tuple(map(float, known[start:stop]))
+        else:
+            # A joint position is no sensible force, speed or activation.
+            on_joint = actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT
+            held = positions.get(actuator.target, 0.0) if on_joint else 0.0
+            ctrl[actuator] = tuple(held if what == "position" else 0.0 for what in inputs)
+        start = stop
+    return ctrl
+
+
+def _joint_pos_of_key(
+    key: XmlKey | None, spec: mujoco.MjSpec, joints: tuple[mujoco.MjsJoint, ...]
+) -> tuple[float, ...]:
+    if key is None:
+        raise ValueError(
+            "init_state.joint_pos is None, which takes the joint positions from the first "
+            f"keyframe of the XML, but the spec {spec.modelname!r} has no keyframe. Add one, or "
+            "give joint_pos as a dict of joint name pattern to position."
+        )
+    expected = sum(qpos_width(joint.type) for joint in spec.joints)
+    if len(key.qpos) != expected:
+        raise ValueError(
+            "init_state.joint_pos is None, which takes the joint positions from the keyframe "
+            f"{key.name!r}, but that has {len(key.qpos)} values in qpos and the spec "
+            f"{spec.modelname!r} needs {expected}."
+        )
+    start, values = 0, {}
+    for joint in spec.joints:
+        values[joint] = key.qpos[start]
+        start += qpos_width(joint.type)
+    return _floats(values[joint] for joint in joints)
+
+
+def _floats(values: Iterable[float]) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)
+
+
+def _vector(values: tuple[float, ...], length: int, what: str) -> tuple[float, ...]:
+    if len(values) != length:
+        raise ValueError(
+            f"init_state.{what} has {len(values)} values ({tuple(values)}); it needs {length}."
+        )
+    return _floats(values)
+
+
+# MERGED mjlab.entity.building: Resolving actuator configs to an entity's joints, tendons and sites.
+
+_ORDER = {TransmissionType.JOINT: 0, TransmissionType.TENDON: 1, TransmissionType.SITE: 2}
+
+
+def build_actuators(entity: Entity) -> list[Actuator]:
+    """Build the configured actuators and add their elements to the entity's spec.
+
+    Elements come config by config, or, with `sort_actuators`, in the order of what they act on
+    (joints, then tendons, then sites), after those that the XML already has.
+
+    Raises:
+        ValueError: the patterns of a config do not resolve, with the reason and the candidates; or
+            what they match has an actuator already, of another config, or of the XML with the name
+            that the new one gets. Other actuators of the XML stay, with a warning: both act.
+    """
+    articulation = entity.cfg.articulation
+    if articulation is None:
+        return []
+    built = []
+    for cfg in articulation.actuators:
+        ids, names = _find_targets(entity, cfg)
+        built.append((cfg.build(entity, ids, names), ids))
+    _check_second_actuators(entity, built)
+    if entity.cfg.sort_actuators:
+        _add_sorted(entity, built)
+    else:
+        # Those that wrap the XML's actuators come first, before there are others to find. They
+        # add nothing.
+        for actuator, ids in sorted(built, key=lambda pair: not _wraps_xml(pair[0])):
+            _add(entity, actuator, ids)
+    return [actuator for actuator, _ in built]
+
+
+def _wraps_xml(actuator: Actuator) -> bool:
+    return isinstance(actuator.cfg, XmlActuatorCfg)
+
+
+def _check_second_actuators(entity: Entity, built: list[tuple[Actuator, list[int]]]) -> None:
+    """Warn if a config adds an actuator to a target that has one of the XML: their forces add up.
+
+    Raises:
+        ValueError: two configs act on one target, or the actuators would have the same name.
+    """
+    in_xml: dict[tuple[TransmissionType, str], list[str]] = {}
+    for element in entity.spec.actuators:
+        for transmission, kinds in XML_TRANSMISSIONS.items():
+            if element.trntype in kinds:
+                in_xml.setdefault((transmission, element.target), []).append(element.name)
+    names_in_xml = {element.name for element in entity.spec.actuators}
+    claimed: dict[tuple[bool, TransmissionType, str], str] = {}
+    for actuator, ids in built:
+        cfg, kind = actuator.cfg, actuator.transmission_type
+        wraps = _wraps_xml(actuator)
+        label = f"{type(cfg).__name__}({cfg.target_names_expr!r})"
+        names = [_elements(entity, kind)[index].name for index in ids]
+        # One that wraps those of the XML leaves out what has none.
+        names = [name for name in names if (kind, name) in in_xml or not wraps]
+        taken = {
+            n: f"one by {claimed[wraps, kind, n]}" for n in names if (wraps, kind, n) in claimed
+        }
+        beside = {
+            name: " and ".join(
+                f"the actuator {other or '(unnamed)'!r} of the XML" for other in in_xml[kind, name]
+            )
+            for name in names
+            if not wraps and (kind, name) in in_xml
+        }
+        taken |= {name: by for name, by in beside.items() if name in in_xml[kind, name]}
+        message = f"{label} acts on {kind.value}s that have an actuator already: "
+        if taken:
+            raise ValueError(
+                f"{message}{_list_taken(taken)}. Give each one actuator: narrow the patterns, remove "
+                "the actuator from the XML, or use it as it is there, by XmlActuatorCfg alone."
+            )
+        # New actuators are named as what they act on.
+        same = [short_name(name) for name in names if not wraps and name in names_in_xml]
+        if same:
+            raise ValueError(
+                f"{label} adds actuators to the {kind.value}s {same}, and names them so; the XML has "
+                "actuators of these names on other targets. Rename or remove those in the XML."
+            )
+        if beside:
+            warnings.warn(
+                f"{message}{_list_taken(beside)}. Both act, and their forces add up. If that is not "
+                "meant, remove the actuator from the XML.",
+                UserWarning,
+                stacklevel=2,
+            )
+        claimed |= dict.fromkeys(((wraps, kind, name) for name in names), label)
+
+
+def _list_taken(taken: dict[str, str]) -> str:
+    return ", ".join(f"{short_name(name)!r} has {by}" for name, by in taken.items())
+
+
+def _add(entity: Entity, actuator: Actuator, ids: list[int]) -> None:
+    # An entity's own names leave out the prefixes of specs that it was put together from, but
+    # elements of the spec refer to each other by full names.
+    elements = _elements(entity, actuator.transmission_type)
+    actuator.edit_spec(entity.spec, [elements[index].name for index in ids])
+
+
+def _add_sorted(entity: Entity, built: list[tuple[Actuator, list[int]]]) -> None:
+    pairs = []
+    for position, (actuator, ids) in enumerate(built):
+        if _wraps_xml(actuator):
+            _add(entity, actuator, ids)
+        else:
+            order = _ORDER[actuator.transmission_type]
+            pairs.extend((order, index, position, actuator) for index in ids)
+    for _, index, _, actuator in sorted(pairs, key=lambda pair: pair[:3]):
+        _add(entity, actuator, [index])
+
+
+def _elements(entity: Entity, transmission: TransmissionType) -> Sequence[Any]:
+    if transmission == TransmissionType.JOINT:
+        return entity.joints
+    return entity.spec.tendons if transmission == TransmissionType.TENDON else entity.spec.sites
+
+
+def _namespace(entity: Entity, transmission: TransmissionType) -> tuple[str, ...]:
+    return tuple(short_name(element.name) for element in _elements(entity, transmission))
+
+
+def _find_targets(entity: Entity, cfg: ActuatorCfg) -> tuple[list[int], list[str]]:
+    patterns, kind = cfg.target_names_expr, cfg.transmission_type
+    find = {
+        TransmissionType.JOINT: entity.find_joints,
+        TransmissionType.TENDON: entity.find_tendons,
+        TransmissionType.SITE: entity.find_sites,
+    }[kind]
+    try:
+        ids, names = find(patterns)
+    except ValueError as error:
+        raise ValueError(
+            f"{type(cfg).__name__}(target_names_expr={patterns!r}, transmission_type="
+            f"{kind.value!r}): {error}{_elsewhere(entity, cfg)}"
+        ) from None
+    if not names:
+        raise ValueError(
+            f"{type(cfg).__name__}(target_names_expr={patterns!r}) names no {kind.value}. "
+            f"Available: {list(_namespace(entity, kind))}."
+        )
+    if "" in names:
+        raise ValueError(
+            f"{type(cfg).__name__}(target_names_expr={patterns!r}) matches a {kind.value} without "
+            "a name, which no actuator can refer to. Name it in the XML."
+        )
+    _warn_if_ambiguous(entity, cfg)
+    return ids, names
+
+
+def _elsewhere(entity: Entity, cfg: ActuatorCfg) -> str:
+    """Say where else the patterns match, for somebody who forgot the transmission type."""
+    hints = []
+    for other in _others(cfg):
+        found = [n for n in _namespace(entity, other) if _any_match(cfg.target_names_expr, n)]
+        if found:
+            hints.append(
+                f"{other.value}s {found} (transmission_type=TransmissionType.{other.name})"
+            )
+    return f"\nThe patterns do match: {'; '.join(hints)}." if hints else ""
+
+
+def _warn_if_ambiguous(entity: Entity, cfg: ActuatorCfg) -> None:
+    patterns = cfg.target_names_expr
+    for other in _others(cfg):
+        names = _namespace(entity, other)
+        if all(any(re.fullmatch(pattern, name) for name in names) for pattern in patterns):
+            found = [name for name in names if _any_match(patterns, name)]
+            warnings.warn(
+                f"{type(cfg).__name__}(target_names_expr={patterns!r}) acts on "
+                f"{cfg.transmission_type.value}s, but its patterns also match the {other.value}s "
+                f"{found}. Make the patterns unambiguous, or set transmission_type.",
+                UserWarning,
+                stacklevel=2,
+            )
+
+
+def _others(cfg: ActuatorCfg) -> list[TransmissionType]:
+    return [kind for kind in TransmissionType if kind != cfg.transmission_type]
+
+
+def _any_match(patterns: tuple[str, ...], name: str) -> bool:
+    return any(re.fullmatch(pattern, name) for pattern in patterns)
+
+
+# MERGED mjlab.entity.building: What an entity's spec is made of: which joints it has, and where its root is.
+
+_FREE = mujoco.mjtJoint.mjJNT_FREE
+_BALL = mujoco.mjtJoint.mjJNT_BALL
+
+
+def find_joints(
+    spec: mujoco.MjSpec,
+) -> tuple[mujoco.MjsJoint | None, tuple[mujoco.MjsJoint, ...]]:
+    """Return the free joint of `spec`, if any, and the others. An unnamed free joint is named.
+
+    Raises:
+        ValueError: there are several free joints, one that is not the first joint, or ball joints.
+    """
+    joints = tuple(spec.joints)
+    free = [joint for joint in joints if joint.type == _FREE]
+    if len(free) > 1:
+        raise ValueError(
+            f"The spec {spec.modelname!r} has {len(free)} free joints, of the bodies "
+            f"{[joint.parent.name for joint in free]}; an entity may have one. Make each "
+            "floating body an entity of its own."
+        )
+    if free and joints[0] is not free[0]:
+        raise ValueError(
+            f"The free joint of body {free[0].parent.name!r} comes after the joint "
+            f"{joints[0].name!r} of body {joints[0].parent.name!r}. The free joint must be the "
+            "first joint of an entity: put its body first, or make it an entity of its own."
+        )
+    balls = [joint.name or f"(unnamed, of {joint.parent.name!r})" for joint in joints
+             if joint.type == _BALL]  # fmt: skip
+    if balls:
+        raise ValueError(
+            f"The spec {spec.modelname!r} has ball joints: {balls}. An entity's joints have one "
+            "position each; use three hinges instead."
+        )
+    if free and not free[0].name:
+        free[0].name = "floating_base_joint"
+    return (free[0] if free else None), tuple(joint for joint in joints if joint.type != _FREE)
+
+
+def place_body(body: mujoco.MjsBody, pose: tuple[float, ...]) -> None:
+    """Set where a body is in its parent: position, quaternion (w, x, y, z)."""
+    body.pos[:] = pose[:3]
+    # An orientation written in another form would win over the quaternion.
+    body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    body.quat[:] = pose[3:7]
+
+
+# MERGED mjlab.entity.building: The simulation options that an entity's own XML asks for.
+#
+# A scene has one `<option>`. Attaching a spec to the scene drops the `<option>` of that spec, so what
+# an entity asks for is taken out before, and the scene decides what becomes of it.
+
+
+# The order of MuJoCo's MJOPTION_FIELDS (mjxmacro.h), which is that of the bits in
+# `spec.authored.option`: they tell a value that was written out from one that was left open.
+_AUTHORED_ORDER = (
+    "timestep",
+    "impratio",
+    "tolerance",
+    "ls_tolerance",
+    "noslip_tolerance",
+    "ccd_tolerance",
+    "sleep_tolerance",
+    "gravity",
+    "wind",
+    "magnetic",
+    "density",
+    "viscosity",
+    "o_margin",
+    "o_solref",
+    "o_solimp",
+    "o_friction",
+    "integrator",
+    "cone",
+    "jacobian",
+    "solver",
+    "iterations",
+    "ls_iterations",
+    "noslip_iterations",
+    "ccd_iterations",
+    "disableflags",
+    "enableflags",
+    "disableactuator",
+    "sdf_initpoints",
+    "sdf_iterations",
+)
+BIT_FIELDS = ("disableflags", "enableflags", "disableactuator")
+"""Options that are sets of independent switches, one a bit."""
+
+
+@dataclass(frozen=True)
+class EntityOptions:
+    """Options that a spec states: written out in its XML, or different from MuJoCo's defaults."""
+
+    values: dict[str, Any] = field(default_factory=dict)
+    """Option field to value: a number, or a tuple for vectors."""
+    switches: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """For each of `BIT_FIELDS`: (bits that are set, bits about which the spec says anything)."""
+
+
+def stated_options(spec: mujoco.MjSpec) -> EntityOptions:
+    """Return the options that `spec` states."""
+    default = mujoco.MjSpec().option
+    values = {
+        name: _plain(getattr(spec.option, name))
+        for position, name in enumerate(_AUTHORED_ORDER)
+        if name not in BIT_FIELDS
+        and (
+            spec.authored.option >> position & 1
+            or not np.array_equal(getattr(spec.option, name), getattr(default, name))
+        )
+    }
+    switches = {}
+    for name in BIT_FIELDS:
+        bits = int(getattr(spec.option, name))
+        stated = bits | int(getattr(spec.authored, name))
+        if stated:
+            switches[name] = (bits, stated)
+    return EntityOptions(values, switches)
+
+
+def take_options(spec: mujoco.MjSpec) -> EntityOptions:
+    """Return the options that `spec` states, and put its `<option>` back to MuJoCo's defaults.
+
+    Without the second, MuJoCo would warn at every attachment about values that are not lost.
+    """
+    options, default = stated_options(spec), mujoco.MjSpec().option
+    for name in _AUTHORED_ORDER:
+        write_option(spec.option, name, getattr(default, name))
+    spec.authored.option = 0
+    for name in BIT_FIELDS:
+        setattr(spec.authored, name, 0)
+    return options
+
+
+def write_option(option: Any, name: str, value: Any) -> None:
+    """Set a field of a MuJoCo option block, element by element where it is a vector."""
+    current = getattr(option, name)
+    if isinstance(current, np.ndarray):
+        current[:] = value
+    else:
+        setattr(option, name, value)
+
+
+def _plain(value: Any) -> Any:
+    return tuple(value.tolist()) if isinstance(value, np.ndarray) else value

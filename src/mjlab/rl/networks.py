@@ -1,0 +1,302 @@
+"""TODO."""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Generator, Mapping
+from typing import Any
+
+import torch
+
+from mjlab.rl.rsl import CNN, PPO, CNNModel, MLPModel, RNNModel, TensorDict, resolve_callable
+from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
+
+# MERGED mjlab.rl.networks: Whether the networks of a run can take the observations that its config gives them.
+
+_MODELS = ("actor", "critic", "student", "teacher")
+_SAC_MODELS = {"actor": SacActorModel, "critic": TwinCriticModel}
+
+# Keys of a CNN config that are not for rsl_rl's CNN.
+_SPATIAL_SOFTMAX_KEYS = ("spatial_softmax", "spatial_softmax_temperature")
+_EXAMPLE = (
+    "class_name='CNNModel' or 'mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel', with "
+    "cnn_cfg={'output_channels': [16, 32], 'kernel_size': [5, 3], 'stride': [2, 2], "
+    "'padding': 'zeros'}"
+)
+
+
+def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
+    """Refuse networks that cannot take their observations.
+
+    Args:
+        observations: Observations of the environment.
+        cfg: The runner's config as a dict.
+
+    Raises:
+        ValueError: naming the network and the group of observations, and what to do.
+    """
+    if "replay_steps" in cfg["algorithm"]:
+        _check_sac_models(observations, cfg)
+    student = cfg.get("student")
+    if isinstance(student, dict) and student.get("distribution_cfg") is None:
+        raise ValueError(
+            "agent.student distribution_cfg: expected a distribution, got None; use "
+            "gaussian_distribution(0.1), whose deviation is that of the actions while learning."
+        )
+    shared = bool(cfg["algorithm"].get("share_cnn_encoders"))
+    images = {}
+    for model in _MODELS:
+        if isinstance(cfg.get(model), dict):
+            images[model] = _check_model(observations, cfg, model, shared)
+    if shared:
+        _check_sharing(images)
+    for model in images:
+        settings = cfg[model]
+        is_blind = resolve_callable(settings["class_name"]) in (MLPModel, RNNModel)
+        if is_blind and settings.get("cnn_cfg") is not None:
+            raise ValueError(
+                f"agent.{model} cnn_cfg: expected None for class_name {settings['class_name']!r}, which "
+                f"has no image encoder, got {settings['cnn_cfg']}; use class_name='CNNModel'."
+            )
+
+
+def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:
+    """Raise ValueError if PPO's mini-batches would be empty: the loss is NaN, or nothing is learned."""
+    algorithm = cfg["algorithm"]
+    # Those of packages may divide their data as they like.
+    if resolve_callable(algorithm["class_name"]) is not PPO:
+        return
+    # rsl_rl keeps the steps of an environment together for networks that remember them.
+    kinds = [resolve_callable(cfg[model]["class_name"]) for model in ("actor", "critic")]
+    is_recurrent = any(getattr(kind, "is_recurrent", False) for kind in kinds)
+    steps = cfg["num_steps_per_env"]
+    most = num_envs if is_recurrent else num_envs * steps
+    parts = algorithm.get("num_mini_batches", 1)
+    if not 1 <= parts <= most:
+        of = f"{num_envs} environments" + ("" if is_recurrent else f" times {steps} steps")
+        why = ", which recurrent networks learn from as a whole" if is_recurrent else ""
+        raise ValueError(
+            f"agent.algorithm num_mini_batches: expected 1 to {most} ({of}{why}), got {parts}; use "
+            "fewer mini-batches, or more environments."
+        )
+
+
+def _check_sac_models(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
+    for model, needed in _SAC_MODELS.items():
+        name = cfg[model]["class_name"]
+        kind = resolve_callable(name)
+        if not (isinstance(kind, type) and issubclass(kind, needed)):
+            raise ValueError(
+                f"agent.{model} class_name: expected {needed.__module__}:{needed.__name__} or a "
+                f"subclass for the learner 'sac', got {name!r}; leave it out, or use --learner ppo."
+            )
+        for group in (cfg.get("obs_groups") or {}).get(model, (model,)):
+            value = observations.get(group, None)
+            if isinstance(value, torch.Tensor) and value.ndim == 4:
+                raise ValueError(
+                    f"agent.obs_groups[{model!r}]: expected flat observations for the learner "
+                    f"'sac', got {group!r}, which holds images of shape {tuple(value.shape[1:])}; "
+                    "use --learner ppo."
+                )
+
+
+def _check_model(
+    observations: TensorDict, cfg: Mapping[str, Any], model: str, shared: bool
+) -> tuple[str, ...] | None:
+    """Check one network; return the image groups that it encodes, None without encoders."""
+    given = (cfg.get("obs_groups") or {}).get(model, (model,))
+    missing = [name for name in given if name not in observations]
+    if missing and model in (cfg.get("obs_groups") or {}):
+        raise ValueError(
+            f"obs_groups[{model!r}] names {missing}, and the observation groups of the environment "
+            f"are {sorted(observations.keys())}."
+        )
+    groups = {name: observations[name] for name in given if name in observations}
+    for name, value in groups.items():
+        _check_group(name, value)
+    images = tuple(name for name, value in groups.items() if value.ndim == 4)
+    kind = resolve_callable(cfg[model]["class_name"])
+    if isinstance(kind, type) and issubclass(kind, CNNModel):
+        if groups and not images:
+            raise ValueError(
+                f"The {model} has image encoders (class_name {cfg[model]['class_name']!r}), and "
+                f"its observation groups {list(groups)} have no images, which are (channels, "
+                "height, width). Use class_name='MLPModel', or add a group of images to "
+                f"obs_groups[{model!r}]."
+            )
+        if model != "critic" or not shared:
+            cnn_cfg = cfg[model].get("cnn_cfg")
+            _check_encoders(model, kind, cnn_cfg, {n: groups[n] for n in images})
+        return images
+    # Models of other packages may take what they like.
+    if images and getattr(kind, "_get_obs_dim", None) is MLPModel._get_obs_dim:
+        raise ValueError(
+            f"The {model} (class_name {cfg[model]['class_name']!r}) takes flat observations only, "
+            f"and its observation group {images[0]!r} holds images of shape "
+            f"{tuple(groups[images[0]].shape[1:])}. Give it an image encoder ({_EXAMPLE}), or "
+            f"take {images[0]!r} out of obs_groups[{model!r}]."
+        )
+    return None
+
+
+def _check_group(name: str, value: Any) -> None:
+    if not isinstance(value, torch.Tensor):
+        raise ValueError(
+            f"The observation group {name!r} is a dict of {sorted(value.keys())}, and networks "
+            "take tensors. Set concatenate_terms=True, or make a group of each term."
+        )
+    if value.ndim not in (2, 4):
+        raise ValueError(
+            f"The observation group {name!r} has shape {tuple(value.shape[1:])} for each "
+            "environment; networks take flat observations (size,) and images (channels, height, "
+            "width). Flatten it (flatten_history_dim=True where it is a history)."
+        )
+    if not value.is_floating_point():
+        raise ValueError(
+            f"The observation group {name!r} is of {value.dtype}, and networks take floating-point "
+            "numbers. Convert it in its observation term."
+        )
+
+
+def _check_encoders(model: str, kind: type, cnn_cfg: Any, images: dict[str, torch.Tensor]) -> None:
+    if not cnn_cfg:
+        raise ValueError(f"The {model} sees images {list(images)} and has no cnn_cfg. {_EXAMPLE}")
+    if not isinstance(cnn_cfg, dict):
+        raise ValueError(f"The {model}'s cnn_cfg is {cnn_cfg!r}; it has to be a dict. {_EXAMPLE}")
+    by_group = all(isinstance(value, dict) for value in cnn_cfg.values())
+    if by_group and set(cnn_cfg) != set(images):
+        raise ValueError(
+            f"The {model}'s cnn_cfg has configs for {sorted(cnn_cfg)}, and its image groups are "
+            f"{sorted(images)}; give one for each, or one for all."
+        )
+    for name, value in images.items():
+        own = cnn_cfg[name] if by_group else cnn_cfg
+        _check_spatial_softmax(model, kind, own)
+        settings = {k: v for k, v in own.items() if k not in _SPATIAL_SOFTMAX_KEYS}
+        try:
+            # On the meta device nothing is computed and no random number is drawn.
+            with torch.device("meta"):
+                _, channels, height, width = value.shape
+                encoder = CNN((height, width), channels, **settings)
+                encoder(torch.empty(1, *value.shape[1:]))
+        except (RuntimeError, TypeError, ValueError, IndexError, KeyError) as error:
+            raise ValueError(
+                f"The {model}'s cnn_cfg makes no encoder for the images {name!r} of shape "
+                f"{tuple(value.shape[1:])}: {str(error).splitlines()[0]}. The settings are "
+                f"{settings}; images have to be large enough for all layers."
+            ) from error
+
+
+def _check_spatial_softmax(model: str, kind: type, settings: dict[str, Any]) -> None:
+    extra = [name for name in _SPATIAL_SOFTMAX_KEYS if name in settings]
+    if extra and kind is CNNModel:
+        raise ValueError(
+            f"The {model}'s cnn_cfg has {extra}, and class_name='CNNModel' has no spatial softmax. "
+            "Take them out, or use class_name='mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel'."
+        )
+    temperature = settings.get("spatial_softmax_temperature", 1.0)
+    if not (isinstance(temperature, (int, float)) and temperature > 0.0):
+        raise ValueError(
+            f"The {model}'s cnn_cfg has spatial_softmax_temperature={temperature!r}; it has to be a "
+            "positive number."
+        )
+
+
+def _check_sharing(images: Mapping[str, tuple[str, ...] | None]) -> None:
+    actor, critic = images.get("actor"), images.get("critic")
+    if actor is None or critic is None or set(actor) != set(critic):
+        raise ValueError(
+            "algorithm.share_cnn_encoders is True, so actor and critic need image encoders for the "
+            f"same groups; the actor has them for {_listed(actor)}, the critic for "
+            f"{_listed(critic)}. Give both the same image groups in obs_groups and a CNN class, or "
+            "set share_cnn_encoders=False."
+        )
+
+
+def _listed(groups: tuple[str, ...] | None) -> str:
+    return "none" if not groups else str(list(groups))
+
+
+# MERGED mjlab.rl.networks: What networks with image encoders need beyond rsl_rl: settings that fit, and encoders shared.
+
+
+def settle_image_settings(observations: TensorDict, cfg: dict[str, Any]) -> None:
+    """Edit a runner's config, in place, where rsl_rl would fail on settings without effect.
+
+    A network that sees images only has nothing to normalize, since images never are. A critic that
+    shares the actor's encoders needs no settings for its own.
+    """
+    for model in ("actor", "critic", "student", "teacher"):
+        groups = (cfg.get("obs_groups") or {}).get(model, ())
+        known = [observations[name] for name in groups if name in observations]
+        if cfg.get(model) and known and all(value.ndim == 4 for value in known):
+            cfg[model]["obs_normalization"] = False
+    if cfg["algorithm"].get("share_cnn_encoders"):
+        cfg["critic"].setdefault("cnn_cfg", cfg["actor"].get("cnn_cfg"))
+
+
+@contextlib.contextmanager
+def shared_parameters_allowed() -> Generator[None]:
+    """Let rsl_rl hand parameters of shared encoders to its optimizer twice; see `train_once`."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*duplicate parameters")
+        yield
+
+
+def train_once(optimizer: torch.optim.Optimizer) -> None:
+    """Make `optimizer`, before its first step, change each parameter once a step.
+
+    rsl_rl gives it the parameters of the actor and those of the critic, hence those of encoders
+    that both share twice, and each step would move them twice by the same gradient.
+    """
+    for group in optimizer.param_groups:
+        group["params"] = list(dict.fromkeys(group["params"]))
+
+
+# MERGED mjlab.rl.networks: Refusing a `symmetry_cfg` that would fail at the first update of a training run.
+
+_FUNCTION = "data_augmentation_func"
+_ALLOWED = {_FUNCTION, "use_data_augmentation", "use_mirror_loss", "mirror_loss_coeff"}
+_EXAMPLE_symmetry_check = (
+    'An example is {"data_augmentation_func": "mjlab.tasks.velocity.symmetry:mirror_left_right", '
+    '"use_data_augmentation": True}; None is without.'
+)
+
+
+def check_symmetry(env: Any, observations: Any, cfg: Mapping[str, Any]) -> None:
+    """Let the function of `symmetry_cfg` mirror the observations once.
+
+    Args:
+        env: The environments.
+        observations: Their observations, a TensorDict of batch size (N,).
+        cfg: A `RslRlOnPolicyRunnerCfg` as a dict.
+
+    Raises:
+        ValueError: a setting is missing or unknown, the function does not exist, or it does not
+            return the given rows and as many or more mirrored ones.
+    """
+    symmetry = cfg["algorithm"].get("symmetry_cfg")
+    if not symmetry:
+        return
+    if _FUNCTION not in symmetry or not set(symmetry) <= _ALLOWED:
+        raise ValueError(
+            f"symmetry_cfg has {', '.join(map(str, symmetry))}; it needs {_FUNCTION}, and may have "
+            f"{', '.join(sorted(_ALLOWED - {_FUNCTION}))}. {_EXAMPLE_symmetry_check}"
+        )
+    try:
+        function = resolve_callable(symmetry[_FUNCTION])
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"symmetry_cfg names the function {symmetry[_FUNCTION]!r}, which cannot be imported: "
+            f"{error}. {_EXAMPLE_symmetry_check}"
+        ) from error
+    actions = torch.zeros(env.num_envs, env.num_actions, device=env.device)
+    mirrored, mirrored_actions = function(env=env, obs=observations, actions=actions)
+    rows, action_rows = mirrored.batch_size[0], mirrored_actions.shape[0]
+    if rows != action_rows or rows < 2 * env.num_envs or rows % env.num_envs:
+        raise ValueError(
+            f"The function {symmetry[_FUNCTION]!r} of symmetry_cfg returned {rows} observations and "
+            f"{action_rows} actions for {env.num_envs} environments; it has to return the given ones "
+            "and as many mirror images of all of them."
+        )

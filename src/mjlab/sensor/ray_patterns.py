@@ -1,0 +1,237 @@
+"""TODO."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from dataclasses import dataclass
+
+import mujoco
+import torch
+
+# MERGED mjlab.sensor.ray_patterns: Ray patterns: where the rays of one frame start, and where they point.
+#
+# A pattern gives offsets (n, 3) in metres and unit directions (n, 3), both in the aligned frame of a
+# ray sensor.
+
+Rays = tuple[torch.Tensor, torch.Tensor]
+"""Offsets (n, 3) and unit directions (n, 3) in the aligned frame."""
+_DOWN = (0.0, 0.0, -1.0)
+
+
+@dataclass
+class GridPatternCfg:
+    """Parallel rays from a rectangular grid in the frame's xy plane.
+
+    The rays are at `-size / 2 + k resolution`, as far as `size / 2` (with half a `resolution` to
+    spare), x fastest. So the grid is centred where `size` is a multiple of `resolution`.
+    """
+
+    size: tuple[float, float] = (1.0, 1.0)
+    """Extent along x and y, in metres; 0 gives one row."""
+    resolution: float = 0.1
+    """Distance between neighbouring rays, in metres."""
+    direction: tuple[float, float, float] = _DOWN
+    """Direction of all rays; of any length."""
+
+    def generate_rays(self, mj_model: mujoco.MjModel | None, device: str) -> Rays:
+        """Return offsets and directions, index `row * columns + column` with x along a row.
+
+        Raises:
+            ValueError: a resolution that is not positive, a negative size, no direction.
+        """
+        if not (self.resolution > 0.0 and math.isfinite(self.resolution)):
+            raise ValueError(
+                f"GridPatternCfg.resolution is {self.resolution}; it has to be positive (metres)."
+            )
+        if not all(side >= 0.0 and math.isfinite(side) for side in self.size):
+            raise ValueError(
+                f"GridPatternCfg.size is {self.size}; both have to be 0 or more (metres)."
+            )
+        x, y = (self._positions(side, device) for side in self.size)
+        grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
+        offsets = torch.stack((grid_x, grid_y, torch.zeros_like(grid_x)), dim=-1).flatten(0, 1)
+        return offsets, _parallel(self.direction, len(offsets), "GridPatternCfg", device)
+
+    def _positions(self, side: float, device: str) -> torch.Tensor:
+        # All k with k d < side + d / 2. The margin keeps rounding from adding a ray.
+        count = max(1, math.ceil(side / self.resolution + 0.5 - 1e-9))
+        steps = torch.arange(count, dtype=torch.float64) * self.resolution - side / 2
+        return steps.to(device, torch.float32)
+
+
+@dataclass
+class PinholeCameraPatternCfg:
+    """Rays through the centres of the pixels of a pinhole camera that looks along -z, with +y up.
+
+    Row 0 is the top of the image; the rays go row by row, from left to right.
+    """
+
+    width: int = 16
+    """Pixels in a row."""
+    height: int = 12
+    """Rows."""
+    fovy: float = 45.0
+    """Vertical field of view, in degrees."""
+    _camera_name: str | None = None
+
+    @classmethod
+    def from_mujoco_camera(cls, camera_name: str) -> PinholeCameraPatternCfg:
+        """Take resolution and field of view from a camera of the scene, by its full name.
+
+        Focal length, sensor size and principal point count where the camera has them. The pose of
+        the camera does not: that is the sensor's `frame`.
+        """
+        return cls(_camera_name=camera_name)
+
+    @classmethod
+    def from_intrinsic_matrix(
+        cls, intrinsic_matrix: list[float], width: int, height: int
+    ) -> PinholeCameraPatternCfg:
+        """Take the vertical field of view `2 atan(height / (2 fy))` from a camera matrix.
+
+        Args:
+            intrinsic_matrix: (fx, 0, cx, 0, fy, cy, 0, 0, 1) in pixels; only fy counts.
+            width: Pixels in a row.
+            height: Rows.
+        """
+        if len(intrinsic_matrix) != 9 or not intrinsic_matrix[4] > 0.0:
+            raise ValueError(
+                "from_intrinsic_matrix takes the nine numbers fx, 0, cx, 0, fy, cy, 0, 0, 1 with a "
+                f"positive fy, got {intrinsic_matrix}."
+            )
+        fovy = 2.0 * math.degrees(math.atan(height / (2.0 * intrinsic_matrix[4])))
+        return cls(width=width, height=height, fovy=fovy)
+
+    def generate_rays(self, mj_model: mujoco.MjModel | None, device: str) -> Rays:
+        """Return offsets (all zero) and directions, index `row * width + column`.
+
+        Raises:
+            ValueError: no pixels, a field of view outside (0, 180), or no such camera.
+        """
+        width, height, half_x, half_y, centre = self._image_plane(mj_model)
+        if width < 1 or height < 1:
+            raise ValueError(
+                f"PinholeCameraPatternCfg has {width} x {height} pixels, so no rays; give a width "
+                "and a height of at least 1."
+            )
+        u = (torch.arange(width, dtype=torch.float64) + 0.5) * 2.0 / width - 1.0
+        v = 1.0 - (torch.arange(height, dtype=torch.float64) + 0.5) * 2.0 / height
+        grid_v, grid_u = torch.meshgrid(v, u, indexing="ij")
+        x, y = grid_u * half_x + centre[0], grid_v * half_y + centre[1]
+        directions = torch.stack((x, y, -torch.ones_like(x)), dim=-1).flatten(0, 1)
+        directions = torch.nn.functional.normalize(directions, dim=-1).to(device, torch.float32)
+        return torch.zeros_like(directions), directions
+
+    def _image_plane(
+        self, mj_model: mujoco.MjModel | None
+    ) -> tuple[int, int, float, float, tuple[float, float]]:
+        """Return width, height, and half extents and centre of the image at distance 1."""
+        if self._camera_name is None:
+            half_y = _tan_half(self.fovy)
+            return self.width, self.height, half_y * self.width / self.height, half_y, (0.0, 0.0)
+        if mj_model is None:
+            raise ValueError(
+                f"The pattern of the camera {self._camera_name!r} needs the compiled model."
+            )
+        camera = find_camera(mj_model, self._camera_name)
+        width, height = (int(value) for value in mj_model.cam_resolution[camera])
+        sensor = mj_model.cam_sensorsize[camera]
+        if sensor[1] == 0.0:
+            half_y = _tan_half(float(mj_model.cam_fovy[camera]))
+            return width, height, half_y * width / height, half_y, (0.0, 0.0)
+        fx, fy, cx, cy = (float(value) for value in mj_model.cam_intrinsic[camera])
+        # The principal point shifts the image as it does in MuJoCo's camera frustum.
+        centre = (cx / fx, -cy / fy)
+        return width, height, float(sensor[0]) / (2 * fx), float(sensor[1]) / (2 * fy), centre
+
+
+@dataclass
+class Ring:
+    """One ring of parallel rays, the first on the x axis, then counter-clockwise."""
+
+    radius: float = 0.1
+    """Radius, in metres."""
+    num_samples: int = 8
+    """Number of rays."""
+
+
+@dataclass
+class RingPatternCfg:
+    """Parallel rays from concentric rings in the frame's xy plane: the centre first, then by ring."""
+
+    Ring = Ring
+
+    rings: tuple[Ring, ...]
+    """The rings, in the order of their rays."""
+    include_center: bool = True
+    """Whether one ray starts at the frame's origin."""
+    direction: tuple[float, float, float] = _DOWN
+    """Direction of all rays; of any length."""
+
+    @classmethod
+    def single_ring(
+        cls,
+        radius: float = 0.1,
+        num_samples: int = 8,
+        include_center: bool = True,
+        direction: tuple[float, float, float] = _DOWN,
+    ) -> RingPatternCfg:
+        """Return a pattern of one ring."""
+        return cls((Ring(radius, num_samples),), include_center, direction)
+
+    def generate_rays(self, mj_model: mujoco.MjModel | None, device: str) -> Rays:
+        """Return offsets and directions: centre, then ring by ring.
+
+        Raises:
+            ValueError: a negative radius, a ring without rays, no rays at all, no direction.
+        """
+        points = [(0.0, 0.0, 0.0)] if self.include_center else []
+        for ring in self.rings:
+            if ring.num_samples < 1 or not (ring.radius >= 0.0 and math.isfinite(ring.radius)):
+                raise ValueError(
+                    f"RingPatternCfg has a ring of {ring.num_samples} rays with radius "
+                    f"{ring.radius}; it takes at least 1 ray and a radius of 0 or more (metres)."
+                )
+            for k in range(ring.num_samples):
+                angle = 2.0 * math.pi * k / ring.num_samples
+                points.append((ring.radius * math.cos(angle), ring.radius * math.sin(angle), 0.0))
+        if not points:
+            raise ValueError(
+                "RingPatternCfg has no rays: give rings, or include_center=True for a single ray."
+            )
+        offsets = torch.tensor(points, dtype=torch.float32, device=device)
+        return offsets, _parallel(self.direction, len(points), "RingPatternCfg", device)
+
+
+PatternCfg = GridPatternCfg | PinholeCameraPatternCfg | RingPatternCfg
+
+
+def find_camera(mj_model: mujoco.MjModel, name: str) -> int:
+    """Return the id of the camera `name`; ValueError with close names if there is none."""
+    camera = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, name)
+    if camera < 0:
+        names = [mj_model.camera(i).name for i in range(mj_model.ncam)]
+        close = difflib.get_close_matches(name, names, n=3) or names
+        raise ValueError(
+            f"There is no camera {name!r}. "
+            + (f"The scene has: {', '.join(close)}." if close else "The scene has no cameras.")
+        )
+    return camera
+
+
+def _parallel(direction: tuple[float, ...], count: int, owner: str, device: str) -> torch.Tensor:
+    vector = torch.tensor(direction, dtype=torch.float64)
+    length = float(vector.norm())
+    if vector.shape != (3,) or not (math.isfinite(length) and length > 1e-9):
+        raise ValueError(
+            f"{owner}.direction is {direction}; it takes three numbers that are not all 0."
+        )
+    # One row a ray, so that patterns of parallel and of diverging rays are treated alike.
+    return (vector / length).to(device, torch.float32).repeat(count, 1)
+
+
+def _tan_half(fovy: float) -> float:
+    if not 0.0 < fovy < 180.0:
+        raise ValueError(f"The field of view is {fovy} degrees; it has to be between 0 and 180.")
+    return math.tan(math.radians(fovy) / 2.0)

@@ -1,0 +1,316 @@
+"""TODO."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from mjlab.tasks.tracking.motion_file import Motion, MotionFileError, read_motion
+from mjlab.utils.lab_api.math import quat_inv, quat_mul, yaw_quat
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+    from mjlab.scene import Scene
+
+
+# MERGED mjlab.tasks.tracking.mdp.motion_library: Motions as tensors on the device, ready to be read by frame.
+
+_PER_BODY = ("body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w")
+_PER_JOINT = ("joint_pos", "joint_vel")
+
+
+class MotionLoader:
+    """A motion of T frames, of which the bodies `body_indexes` (K of them) are kept.
+
+    Attributes:
+        fps: Frames per second, or None where the file does not say.
+        joint_pos: (T, nj); likewise `joint_vel`.
+        body_pos_w: (T, K, 3) without origins of environments; likewise `body_lin_vel_w` and
+            `body_ang_vel_w`, and `body_quat_w` (T, K, 4).
+        time_step_total: T.
+    """
+
+    joint_pos: torch.Tensor
+    joint_vel: torch.Tensor
+    body_pos_w: torch.Tensor
+    body_quat_w: torch.Tensor
+    body_lin_vel_w: torch.Tensor
+    body_ang_vel_w: torch.Tensor
+
+    def __init__(
+        self, motion_file: str | Path, body_indexes: torch.Tensor, device: str = "cpu"
+    ) -> None:
+        """Read a file.
+
+        Args:
+            motion_file: The `.npz` file.
+            body_indexes: Bodies to keep, (K,) int64, counted in the robot.
+            device: Where the tensors lie.
+
+        Raises:
+            MotionFileError: the file is no motion, or has fewer bodies.
+        """
+        motion = read_motion(motion_file)
+        bodies = motion.body_pos_w.shape[1]
+        unknown = [i for i in body_indexes.tolist() if not 0 <= i < bodies]
+        if unknown:
+            raise MotionFileError(
+                f"The motion {motion_file} has {bodies} bodies, and not those of the indexes "
+                f"{unknown}."
+            )
+        self._take(motion, body_indexes, device)
+
+    @classmethod
+    def from_motion(
+        cls, motion: Motion, body_indexes: torch.Tensor, device: str = "cpu"
+    ) -> MotionLoader:
+        """Return the loader of a motion that was read before; the arguments are as above."""
+        loader = cls.__new__(cls)
+        loader._take(motion, body_indexes, device)
+        return loader
+
+    def _take(self, motion: Motion, body_indexes: torch.Tensor, device: str) -> None:
+        self.fps = motion.fps
+        for name in _PER_JOINT:
+            setattr(self, name, torch.from_numpy(getattr(motion, name)).to(device))
+        chosen = body_indexes.cpu().numpy()
+        for name in _PER_BODY:
+            kept = getattr(motion, name)[:, chosen]
+            setattr(self, name, torch.from_numpy(kept).to(device))
+        self.time_step_total = motion.num_frames
+
+
+class MotionLibrary:
+    """Several motions, one after the other in the same tensors; one motion is as `MotionLoader`.
+
+    Attributes:
+        names: Name of each of the M motions.
+        starts: (M,) int64, index of the first frame of each.
+        lengths: (M,) int64, frames of each.
+        time_step_total: Frames of all of them.
+
+    The tensors are those of `MotionLoader`, over all frames.
+    """
+
+    joint_pos: torch.Tensor
+    joint_vel: torch.Tensor
+    body_pos_w: torch.Tensor
+    body_quat_w: torch.Tensor
+    body_lin_vel_w: torch.Tensor
+    body_ang_vel_w: torch.Tensor
+
+    def __init__(self, motions: Sequence[MotionLoader], names: Sequence[str]) -> None:
+        """Put motions of the same robot together."""
+        for name in (*_PER_JOINT, *_PER_BODY):
+            setattr(self, name, torch.cat([getattr(motion, name) for motion in motions]))
+        device = self.joint_pos.device
+        self.names = tuple(names)
+        self.lengths = torch.tensor([m.time_step_total for m in motions], device=device)
+        self.starts = torch.cumsum(self.lengths, 0) - self.lengths
+        self.time_step_total = int(self.lengths.sum())
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+# MERGED mjlab.tasks.tracking.mdp.motion_library: The reference beside the robot, under the names that errors are computed from.
+
+
+class MotionReader:
+    """Reads a frame of the reference for each environment, and the robot as it is now.
+
+    N environments, K tracked bodies, nj joints. World frame, quaternions (w, x, y, z), SI units.
+    """
+
+    motion: MotionLibrary
+    robot: Entity
+    body_indexes: torch.Tensor
+    """(K,) int64, the tracked bodies, counted in the robot."""
+    anchor_index: int
+    """Which of the tracked bodies is the anchor."""
+    anchor_body: int
+    """The anchor, counted in the robot."""
+    body_names: tuple[str, ...]
+    """Names of the tracked bodies."""
+    scene: Scene
+    body_pos_relative_w: torch.Tensor
+    """(N, K, 3) relative positions, as of the last refresh; see `relative_poses`."""
+    body_quat_relative_w: torch.Tensor
+    """(N, K, 4) relative orientations, likewise."""
+
+    @property
+    def frame_indexes(self) -> torch.Tensor:
+        """(N,) int64, the frame of each environment, counted over all motions."""
+        raise NotImplementedError
+
+    # The reference.
+
+    @property
+    def joint_pos(self) -> torch.Tensor:
+        """(N, nj) joint positions of the reference."""
+        return self.motion.joint_pos.index_select(0, self.frame_indexes)
+
+    @property
+    def joint_vel(self) -> torch.Tensor:
+        """(N, nj) joint velocities of the reference."""
+        return self.motion.joint_vel.index_select(0, self.frame_indexes)
+
+    @property
+    def body_pos_w(self) -> torch.Tensor:
+        """(N, K, 3) positions of the tracked bodies in the reference."""
+        pos = self.motion.body_pos_w.index_select(0, self.frame_indexes)
+        return pos.add_(self.scene.env_origins[:, None])
+
+    @property
+    def body_quat_w(self) -> torch.Tensor:
+        """(N, K, 4) orientations of the tracked bodies in the reference."""
+        return self.motion.body_quat_w.index_select(0, self.frame_indexes)
+
+    @property
+    def body_lin_vel_w(self) -> torch.Tensor:
+        """(N, K, 3) velocities of the tracked bodies' origins in the reference."""
+        return self.motion.body_lin_vel_w.index_select(0, self.frame_indexes)
+
+    @property
+    def body_ang_vel_w(self) -> torch.Tensor:
+        """(N, K, 3) angular velocities of the tracked bodies in the reference."""
+        return self.motion.body_ang_vel_w.index_select(0, self.frame_indexes)
+
+    @property
+    def anchor_pos_w(self) -> torch.Tensor:
+        """(N, 3) position of the anchor in the reference."""
+        place = self.motion.body_pos_w[:, self.anchor_index].index_select(0, self.frame_indexes)
+        return place.add_(self.scene.env_origins)
+
+    @property
+    def anchor_quat_w(self) -> torch.Tensor:
+        """(N, 4) orientation of the anchor in the reference."""
+        return self.motion.body_quat_w[:, self.anchor_index].index_select(0, self.frame_indexes)
+
+    @property
+    def anchor_lin_vel_w(self) -> torch.Tensor:
+        """(N, 3) velocity of the anchor's origin in the reference."""
+        return self.motion.body_lin_vel_w[:, self.anchor_index].index_select(0, self.frame_indexes)
+
+    @property
+    def anchor_ang_vel_w(self) -> torch.Tensor:
+        """(N, 3) angular velocity of the anchor in the reference."""
+        return self.motion.body_ang_vel_w[:, self.anchor_index].index_select(0, self.frame_indexes)
+
+    # The robot.
+
+    @property
+    def robot_joint_pos(self) -> torch.Tensor:
+        """(N, nj) joint positions of the robot."""
+        return self.robot.data.joint_pos
+
+    @property
+    def robot_joint_vel(self) -> torch.Tensor:
+        """(N, nj) joint velocities of the robot."""
+        return self.robot.data.joint_vel
+
+    @property
+    def robot_body_pos_w(self) -> torch.Tensor:
+        """(N, K, 3) positions of the tracked bodies of the robot."""
+        return self.robot.data.body_link_pos_w.index_select(1, self.body_indexes)
+
+    @property
+    def robot_body_quat_w(self) -> torch.Tensor:
+        """(N, K, 4) orientations of the tracked bodies of the robot."""
+        return self.robot.data.body_link_quat_w.index_select(1, self.body_indexes)
+
+    @property
+    def robot_body_lin_vel_w(self) -> torch.Tensor:
+        """(N, K, 3) velocities of the tracked bodies' origins."""
+        return self.robot.data.link_lin_vel_of(self.body_indexes)
+
+    @property
+    def robot_body_ang_vel_w(self) -> torch.Tensor:
+        """(N, K, 3) angular velocities of the tracked bodies."""
+        return self.robot.data.link_ang_vel_of(self.body_indexes)
+
+    @property
+    def robot_anchor_pos_w(self) -> torch.Tensor:
+        """(N, 3) position of the robot's anchor."""
+        return self.robot.data.body_link_pos_w[:, self.anchor_body]
+
+    @property
+    def robot_anchor_quat_w(self) -> torch.Tensor:
+        """(N, 4) orientation of the robot's anchor."""
+        return self.robot.data.body_link_quat_w[:, self.anchor_body]
+
+    @property
+    def robot_anchor_lin_vel_w(self) -> torch.Tensor:
+        """(N, 3) velocity of the origin of the robot's anchor."""
+        return self.robot_body_lin_vel_w[:, self.anchor_index]
+
+    @property
+    def robot_anchor_ang_vel_w(self) -> torch.Tensor:
+        """(N, 3) angular velocity of the robot's anchor."""
+        return self.robot_body_ang_vel_w[:, self.anchor_index]
+
+    def relative_poses(
+        self, env_ids: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the reference carried to the robot's x, y and heading, at its own height.
+
+        With anchors (p, q) of the reference and (p', q') of the robot, both as they are now, and D
+        the turn about z by the yaw of q' q^-1:
+
+            q_rel = D q_body,   p_rel = (p'_x, p'_y, p_z) + D (p_body - p).
+
+        Args:
+            env_ids: (n,) int64, the environments that are meant; None means all.
+
+        Returns:
+            Positions (n, K, 3) and orientations (n, K, 4).
+        """
+        frames, origins = self.frame_indexes, self.scene.env_origins
+        robot_pos, robot_quat = self.robot_anchor_pos_w, self.robot_anchor_quat_w
+        if env_ids is not None:
+            frames, origins, robot_pos, robot_quat = (
+                part[env_ids] for part in (frames, origins, robot_pos, robot_quat)
+            )
+        # Along x and y the origins of environments cancel out.
+        pos = self.motion.body_pos_w.index_select(0, frames)
+        body_quat = self.motion.body_quat_w.index_select(0, frames)
+        anchor_pos, anchor_quat = pos[:, self.anchor_index], body_quat[:, self.anchor_index]
+        turn = yaw_quat(quat_mul(robot_quat, quat_inv(anchor_quat)))
+        w, z = turn[:, :1], turn[:, 3:]
+        # Written out, because a turn about z takes half of what any other takes.
+        cos, sin = w * w - z * z, 2.0 * w * z
+        x, y, height = pos.unbind(-1)
+        dx, dy = x - anchor_pos[:, :1], y - anchor_pos[:, 1:2]
+        torch.add(cos * dx - sin * dy, robot_pos[:, :1], out=x)
+        torch.add(sin * dx + cos * dy, robot_pos[:, 1:2], out=y)
+        height += origins[:, 2:]
+        quat, turned = body_quat * w.unsqueeze(1), body_quat * z.unsqueeze(1)
+        (qw, qx, qy, qz), (zw, zx, zy, zz) = quat.unbind(-1), turned.unbind(-1)
+        qw -= zz
+        qx -= zy
+        qy += zx
+        qz += zw
+        return pos, quat
+
+
+class MotionFrame(MotionReader):
+    """Other frames than the command's beside the robot as it is now.
+
+    Its relative poses are those of now, where the command keeps those of its last update.
+    """
+
+    def __init__(self, reader: MotionReader, frame_indexes: torch.Tensor) -> None:
+        """Take the frames (N,), counted over all motions, of what `reader` reads."""
+        self.motion, self.robot, self.scene = reader.motion, reader.robot, reader.scene
+        self.body_indexes, self.body_names = reader.body_indexes, reader.body_names
+        self.anchor_index, self.anchor_body = reader.anchor_index, reader.anchor_body
+        self._frame_indexes = frame_indexes
+        self.body_pos_relative_w, self.body_quat_relative_w = self.relative_poses()
+
+    @property
+    def frame_indexes(self) -> torch.Tensor:
+        """(N,) int64, the frames, counted over all motions."""
+        return self._frame_indexes

@@ -1,1 +1,0 @@
-"""The editors behind `mjlab.utils.spec_config`, by what they edit."""
