@@ -314,10 +314,10 @@ class ContactSlot:
     @property
     def data_view(self) -> torch.Tensor:
         """Present values, (N, number of slots times size of the field)."""
-        layout = self.sensor._layout
-        values = layout.split(self.sensor._block())[self.field_name]
-        first = self.index * layout.num_slots
-        return values[:, first : first + layout.num_slots].flatten(1)
+        values = self.sensor._split(self.sensor._block())[self.field_name]
+        num_slots = self.sensor.cfg.num_slots
+        first = self.index * num_slots
+        return values[:, first : first + num_slots].flatten(1)
 
 
 def contact_slots(sensor: ContactSensor) -> list[ContactSlot]:
