@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from mjlab.envs.mdp import dr
 from mjlab.envs.mdp.dr._core import select
-from mjlab.envs.mdp.dr._table import TABLE
 from mjlab.managers.event_manager import EventTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 
+TABLE = {f.row.name: f.row for f in vars(dr).values() if hasattr(f, "row")}
 FIELD_TERMS = sorted(name for name, row in TABLE.items() if not row.rotation)
 ROTATION_TERMS = sorted(name for name, row in TABLE.items() if row.rotation)
 ENGINES = ("native", "warp")
