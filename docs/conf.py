@@ -72,7 +72,7 @@ def _inline(text: str) -> str:
 def _readable(
     app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str, returns: str
 ) -> tuple[str, str | None] | None:
-    """Shorten the signatures of configs, and complete those of functions made from a table."""
+    """Shorten the signatures of configs, and complete those of `field_term`."""
     if what == "class" and dataclasses.is_dataclass(obj):
         # The fields are listed below, with their meanings.
         return "", None

@@ -43,55 +43,6 @@ EnvIds = torch.Tensor | slice | None
 _ROW_SHAPES = {"cam_mat0": (3, 3), "geom_aabb": (2, 3)}
 
 
-class SharedField(torch.Tensor):
-    """Model value that all environments share: reading is free, writing raises `RuntimeError`.
-
-    Writing one row would change every environment. Results of operations are plain tensors.
-    """
-
-    error: str
-
-    @classmethod
-    def make(cls, value: torch.Tensor, nworld: int | None, name: str) -> SharedField:
-        """View `value` as an (nworld, ...) field; as structure, in its own shape, if None."""
-        view = value if nworld is None else value.expand(nworld, *value.shape)
-        field = torch.Tensor._make_subclass(cls, view)
-        field.error = f"Model field {name!r} is shared by all environments and cannot be written. "
-        field.error += (
-            "Change it in the spec or the model from which the Simulation is built."
-            if nworld is None
-            else f"Call sim.expand_model_fields(({name!r},)) first, or declare it with "
-            f"@requires_model_fields({name!r})."
-        )
-        return field
-
-    @classmethod
-    def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        target = args[0] if args else None
-        name = getattr(func, "__name__", "")
-        writes = name == "__setitem__" or (name.endswith("_") and not name.endswith("__"))
-        out = (kwargs or {}).get("out")
-        outputs = out if isinstance(out, tuple | list) else (out,)
-        for tensor in (target, *outputs) if writes else outputs:
-            if isinstance(tensor, SharedField):
-                raise WrongStateError(tensor.error)
-        with torch._C.DisableTorchFunctionSubclass():
-            result = func(*args, **(kwargs or {}))
-        # Views still alias the shared value, so they stay protected. Without elements all tensors
-        # have the same address.
-        if isinstance(target, SharedField):
-            if isinstance(result, np.ndarray):
-                result.flags.writeable = False
-            elif (
-                isinstance(result, torch.Tensor)
-                and result.numel()
-                and result.untyped_storage().data_ptr() == target.untyped_storage().data_ptr()
-            ):
-                result = result.as_subclass(cls)
-                result.error = target.error
-        return result
-
-
 class Simulation:
     """N copies of one MuJoCo model, advanced together by the configured engine.
 
@@ -562,6 +513,55 @@ class Simulation:
         env_ids = env_ids.to(self.device, torch.int64)
         # To sort them, the host would have to wait for a GPU.
         return env_ids if env_ids.is_cuda or len(env_ids) < 2 else env_ids.unique()
+
+
+class SharedField(torch.Tensor):
+    """Model value that all environments share: reading is free, writing raises `RuntimeError`.
+
+    Writing one row would change every environment. Results of operations are plain tensors.
+    """
+
+    error: str
+
+    @classmethod
+    def make(cls, value: torch.Tensor, nworld: int | None, name: str) -> SharedField:
+        """View `value` as an (nworld, ...) field; as structure, in its own shape, if None."""
+        view = value if nworld is None else value.expand(nworld, *value.shape)
+        field = torch.Tensor._make_subclass(cls, view)
+        field.error = f"Model field {name!r} is shared by all environments and cannot be written. "
+        field.error += (
+            "Change it in the spec or the model from which the Simulation is built."
+            if nworld is None
+            else f"Call sim.expand_model_fields(({name!r},)) first, or declare it with "
+            f"@requires_model_fields({name!r})."
+        )
+        return field
+
+    @classmethod
+    def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        target = args[0] if args else None
+        name = getattr(func, "__name__", "")
+        writes = name == "__setitem__" or (name.endswith("_") and not name.endswith("__"))
+        out = (kwargs or {}).get("out")
+        outputs = out if isinstance(out, tuple | list) else (out,)
+        for tensor in (target, *outputs) if writes else outputs:
+            if isinstance(tensor, SharedField):
+                raise WrongStateError(tensor.error)
+        with torch._C.DisableTorchFunctionSubclass():
+            result = func(*args, **(kwargs or {}))
+        # Views still alias the shared value, so they stay protected. Without elements all tensors
+        # have the same address.
+        if isinstance(target, SharedField):
+            if isinstance(result, np.ndarray):
+                result.flags.writeable = False
+            elif (
+                isinstance(result, torch.Tensor)
+                and result.numel()
+                and result.untyped_storage().data_ptr() == target.untyped_storage().data_ptr()
+            ):
+                result = result.as_subclass(cls)
+                result.error = target.error
+        return result
 
 
 def _reshape_rows(field: str, tensor: torch.Tensor) -> torch.Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import pickle
 from typing import Any
 
 import pytest
@@ -81,6 +82,7 @@ def test_public_functions_look_as_if_written_by_hand(name: str) -> None:
     assert parameters["distribution"].default == "uniform"
     assert function.__name__ == name
     assert function.__module__.startswith("mjlab.envs.mdp.dr.")
+    assert pickle.loads(pickle.dumps(function)) is function
     assert function.__doc__
     assert set(TABLE[name].fields) <= set(function.model_fields)
 

@@ -214,7 +214,7 @@ Raises:
 
 @dataclass(frozen=True)
 class FieldRow:
-    """One row of the table: a model field and how it is randomized."""
+    """Model field, and how a public function randomizes it."""
 
     name: str
     """Name of the public function."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
+import numpy as np
 import torch
 
 from mjlab.actuator import (
@@ -333,10 +334,16 @@ _FOLLOWING = (
 def _xml_effort_places(env: ManagerBasedRlEnv, selected: SelectedActuator) -> tuple[Place, ...]:
     """Return the places for XML actuators driven by effort; refuse where no place has an effect."""
     model, ids = env.sim.mj_model, selected.elements[0].tolist()
-    muscles = [model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_MUSCLE for i in ids]
-    if all(muscles):
+    if (model.actuator_gaintype[ids] == mujoco.mjtGain.mjGAIN_MUSCLE).all():
         return _MUSCLE_FORCE
-    by_control = not any(muscles) and all(_is_motor(model, i) for i in ids)
+    # The force of a motor is its control times a gain.
+    motors = (
+        (model.actuator_gaintype[ids] == mujoco.mjtGain.mjGAIN_FIXED)
+        & (model.actuator_biastype[ids] == mujoco.mjtBias.mjBIAS_NONE)
+        & np.isin(model.actuator_dyntype[ids], _FOLLOWING)
+        & (model.actuator_gainprm[ids, 0] != 0.0)
+    )
+    by_control = bool(motors.all())
     idle = [
         selected.actuator.target_names[target]
         for i, target in zip(ids, selected.targets.tolist(), strict=True)
@@ -352,16 +359,6 @@ def _xml_effort_places(env: ManagerBasedRlEnv, selected: SelectedActuator) -> tu
             "or select others by name; motors and muscles have to be selected by one event each."
         )
     return _MOTOR_RANGES if by_control else _FORCE_RANGE
-
-
-def _is_motor(model: mujoco.MjModel, i: int) -> bool:
-    """Return whether the force of an actuator is its control times a gain."""
-    return (
-        model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
-        and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
-        and int(model.actuator_dyntype[i]) in _FOLLOWING
-        and model.actuator_gainprm[i, 0] != 0.0
-    )
 
 
 def _reads(actuator: Actuator, command: CommandField, builtin: type[Actuator]) -> bool:
