@@ -25,7 +25,7 @@ from mjlab.envs.mdp.dr._types import (
 )
 from mjlab.managers.event_manager import RecomputeLevel, requires_model_fields
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.utils.indexing import columns, resolve_env_ids
+from mjlab.utils.indexing import as_columns, as_ids
 from mjlab.utils.lab_api.math import quat_from_euler_xyz, quat_mul
 from mjlab.utils.mujoco import dof_width, qpos_width
 
@@ -373,7 +373,7 @@ def select(
     all_ids: torch.Tensor = getattr(entity.data.indexing, kind.global_ids)
     # Names are looked up for patterns only: randomization may run at nearly every step.
     if pattern is None:
-        chosen = columns(getattr(asset_cfg, kind.cfg_ids), env.device)
+        chosen = as_columns(getattr(asset_cfg, kind.cfg_ids), env.device)
         local_ids = torch.arange(len(all_ids), device=env.device)[chosen]
     else:
         names = getattr(entity, kind.entity_names)
@@ -390,7 +390,9 @@ def select(
         starts, types = getattr(model, start), model.jnt_type
         addresses = [starts[j] + k for j in places.tolist() for k in range(width(types[j]))]
         places = torch.tensor(addresses, dtype=torch.long, device=env.device)
-    return Selection(env, entity, kind, resolve_env_ids(env, env_ids), local_ids, places)
+    return Selection(
+        env, entity, kind, as_ids(env_ids, env.num_envs, env.device), local_ids, places
+    )
 
 
 def model_field(env: ManagerBasedRlEnv, field: str) -> torch.Tensor:
