@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import pickle
 from typing import Any
 
 import pytest
@@ -12,10 +13,10 @@ from hypothesis import strategies as st
 
 from mjlab.envs.mdp import dr
 from mjlab.envs.mdp.dr._core import select
-from mjlab.envs.mdp.dr._table import TABLE
 from mjlab.managers.event_manager import EventTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 
+TABLE = {f.row.name: f.row for f in vars(dr).values() if hasattr(f, "row")}
 FIELD_TERMS = sorted(name for name, row in TABLE.items() if not row.rotation)
 ROTATION_TERMS = sorted(name for name, row in TABLE.items() if row.rotation)
 ENGINES = ("native", "warp")
@@ -81,6 +82,7 @@ def test_public_functions_look_as_if_written_by_hand(name: str) -> None:
     assert parameters["distribution"].default == "uniform"
     assert function.__name__ == name
     assert function.__module__.startswith("mjlab.envs.mdp.dr.")
+    assert pickle.loads(pickle.dumps(function)) is function
     assert function.__doc__
     assert set(TABLE[name].fields) <= set(function.model_fields)
 

@@ -1,26 +1,228 @@
-"""Textures of surfaces and of the sky, with the mappings of MuJoCo's and Warp's renderers.
+"""Colors of surfaces and of the sky on the native engine: lights, materials and textures.
 
+Lights follow the formulas of MuJoCo Warp's renderer, textures the mappings of MuJoCo's and Warp's.
 Components come first: a vector of K points is (3, K). A texture laid onto a mesh by coordinates of
 its vertices shows as its mean color, because rays do not say which face of a mesh they meet.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from mjlab.sim.native.render import Geoms, ReadField, Surfaces
-
 _T = mujoco.mjtGeom
 PLANE, HFIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = (
     int(getattr(_T, f"mjGEOM_{name}"))
     for name in ("PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
 )
+_TINY = 1e-6
+
+ReadField = Callable[[str], Tensor]
+"""A field of `MjData` or `MjModel` by name, of n environments: (n, ...), (1, ...) if they share it."""
+
+
+@dataclass
+class Geoms:
+    """G geoms in the frame of the camera, in n environments."""
+
+    pos: Tensor
+    """Position, (n, G, 3)."""
+    quat: Tensor
+    """Orientation, (n, G, 4)."""
+    mat: Tensor
+    """Orientation, (n, G, 3, 3)."""
+    size: Tensor
+    """Size, (n, G, 3)."""
+    center: Tensor
+    """Center of a box around the geom, in the frame of the geom, (n, G, 3)."""
+    half: Tensor
+    """Half extents of the box, (n, G, 3)."""
+    dataid: Tensor
+    """Height field or mesh, or -1, (n, G) int32."""
+    material: Tensor
+    """Material, -1 for none, (1 or n, G)."""
+    rgba: Tensor
+    """Color, (1 or n, G, 4)."""
+    exists: Tensor
+    """True where an environment has the geom and it is not fully transparent, (n, G) bool."""
+
+
+@dataclass
+class Surfaces:
+    """Hits of n x P rays, in the camera frame."""
+
+    directions: Tensor
+    """Unit vectors along the rays, (3, 1 or n, P)."""
+    points: Tensor
+    """Positions, (3, n, P)."""
+    normals: Tensor
+    """Unit normals, (3, n, P)."""
+    columns: Tensor
+    """Number of the geom among those that are rendered, (n, P); G for nothing."""
+
+
+# Lights.
+
+# What a geom without a material reflects, and its shininess; the exponent of a shininess of 1.
+_SPECULAR, _SHININESS, _MAX_EXPONENT = 0.5, 0.5, 128.0
+# Part of a light that reaches what is in its shadow, and ambient light where there is no light.
+_IN_SHADOW, _WITHOUT_LIGHTS = 0.3, 0.3
+# Shadow rays start so far (metres) above the surface, and end so far before the light.
+_ABOVE, _BEFORE = 1e-4, 1e-3
+# Distance (m) of lights that have no place.
+_ENDLESS = 1e8
+_SPOT = int(mujoco.mjtLightType.mjLIGHT_SPOT)
+_DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+
+
+class Shading:
+    """Colors of surfaces, by the formulas of MuJoCo Warp's renderer.
+
+    A light adds its diffuse color times the cosine between surface and light, and its specular color
+    times a power of the cosine between the surface and the direction halfway to the eye.
+    """
+
+    def __init__(self, model: mujoco.MjModel, kinds: Tensor, use_textures: bool) -> None:
+        """Take the lights and (if wanted) textures of a model, for geoms of types `kinds` (G,)."""
+        self._num_lights, self._headlight = model.nlight, model.vis.headlight
+        self._textures = Textures(model, torch.nn.functional.pad(kinds, (0, 1), value=-1))
+        self._use_textures = use_textures and model.ntex > 0 and model.nmat > 0
+
+    def shade(
+        self,
+        met: Surfaces,
+        geoms: Geoms,
+        pos: Tensor,
+        mat: Tensor,
+        read: ReadField,
+        shadow: Callable[[Tensor, Tensor, Tensor], Tensor] | None,
+    ) -> Tensor:
+        """Return the colors of the rays, (n, P, 3) uint8.
+
+        Args:
+            met: What the rays met.
+            geoms: The geoms that they can meet.
+            pos: Position of the camera, (n, 3). mat: Its orientation, (n, 3, 3).
+            read: Reads fields.
+            shadow: Whether something is in the way: origins (3, n, P), directions, distances (n, P)
+                to (n, P) bool. None for no shadows.
+        """
+        # One entry more, for rays that met nothing.
+        material = torch.nn.functional.pad(geoms.material, (0, 1), value=-1)
+        rgb = torch.nn.functional.pad(geoms.rgba.permute(2, 0, 1)[:3], (0, 1))
+        rgb = of_pixels(rgb, met.columns)
+        if self._use_textures:
+            self._textures.paint(rgb, met, geoms, material, read)
+        exponent = of_materials(read("mat_shininess"), material, _SHININESS) * _MAX_EXPONENT
+        reflected = of_materials(read("mat_specular"), material, _SPECULAR)
+        reflected = torch.where(exponent > 0.0, reflected, 0.0)
+        emission = of_materials(read("mat_emission"), material, 0.0)
+        brightness = torch.zeros_like(rgb)
+        if emission.any():
+            brightness += of_pixels(emission, met.columns)
+        ambient = torch.full((3,), 0.0 if self._num_lights else _WITHOUT_LIGHTS)
+        if self._headlight.active:
+            ambient = torch.tensor(self._headlight.ambient, dtype=torch.float32)
+        own = read("light_ambient") * (read("light_active") != 0)[..., None]
+        brightness += (ambient + own.sum(dim=1)).t()[..., None]
+        shines = bool(reflected.any())
+        if shines:
+            exponent, gloss = of_pixels(exponent, met.columns), torch.zeros_like(rgb)
+            facing = -_dot(met.normals, met.directions)
+        for diffuse, specular, direction, distance, strength, casts_shadow in self._lights(
+            met.points, pos, mat, read
+        ):
+            cosine = _dot(met.normals, direction).clamp_(min=0.0)
+            if shadow is not None and casts_shadow.any():
+                origins = met.points + _ABOVE * met.normals
+                hidden = shadow(origins, direction.expand_as(origins), distance - _BEFORE)
+                hidden &= casts_shadow & (cosine > 0.0)
+                strength = strength * torch.where(hidden, _IN_SHADOW, 1.0)
+            brightness.addcmul_(cosine * strength, diffuse)
+            if shines and specular.any():
+                # |L + V|^2 = 2 + 2 L.V, so that the direction halfway is never needed itself.
+                length = (2.0 - 2.0 * _dot(met.directions, direction)).clamp_(min=1e-12)
+                halfway = (cosine + facing).div_(length.sqrt_()).clamp_(0.0, 1.0)
+                halfway = halfway.pow_(exponent).masked_fill_(cosine <= 0.0, 0.0)
+                gloss.addcmul_(halfway.mul_(strength), specular)
+        rgb *= brightness
+        if shines:
+            rgb += gloss.mul_(of_pixels(reflected, met.columns))
+        missed = met.columns == geoms.pos.shape[1]
+        rgb.clamp_(0.0, 1.0).masked_fill_(missed, 0.0)
+        env, pixel = missed.nonzero(as_tuple=True)
+        if len(env):
+            directions = met.directions.expand_as(met.points)[:, env, pixel]
+            world = (mat[env] @ directions.t()[..., None]).squeeze(-1).t()
+            self._textures.paint_sky(rgb, missed, world)
+        return torch.stack(rgb.mul_(255.0).to(torch.uint8).unbind(), dim=-1)
+
+    def _lights(
+        self, points: Tensor, pos: Tensor, mat: Tensor, read: ReadField
+    ) -> Iterator[tuple[Tensor, ...]]:
+        """Yield what each light that shines somewhere is at the points (3, n, P).
+
+        Axes n and P may be 1. Yields:
+            Diffuse and specular color, (3, n, 1).
+            Unit vector to the light, (3, n, P), and distance (m), (n, P).
+            Part that arrives, (n, P).
+            Whether it casts shadows, (n, 1) bool.
+        """
+        endless, one = torch.full((1, 1), _ENDLESS), torch.ones(1, 1)
+        for i in range(self._num_lights):
+
+            def own(name: str, i: int = i) -> Tensor:
+                return read(f"light_{name}")[:, i, None]
+
+            active = own("active") != 0
+            diffuse = (own("diffuse").squeeze(1) * active).t()[..., None]
+            specular = (own("specular").squeeze(1) * active).t()[..., None]
+            if not (diffuse.any() or specular.any()):
+                continue
+            axis = (read("light_xdir")[:, i, None] @ mat).permute(2, 0, 1)
+            direction, distance, strength = -axis, endless, one
+            is_far = own("type") == _DIRECTIONAL
+            if not is_far.all():
+                to_light = ((read("light_xpos")[:, i] - pos)[:, None] @ mat).permute(2, 0, 1)
+                to_light = to_light - points
+                distance = _dot(to_light, to_light).sqrt_()
+                # MuJoCo raises for a ray without a direction, as one would be at the light itself.
+                to_light = torch.where(distance > 0.0, to_light / distance, direction)
+                constant, linear, squared = own("attenuation").permute(2, 0, 1)
+                strength = 1.0 / (constant + distance * (linear + distance * squared))
+                strength.masked_fill_(strength.isinf(), 0.0)
+                is_spot = own("type") == _SPOT
+                if is_spot.any():
+                    on_axis = -_dot(axis, to_light)
+                    spot = on_axis.clamp(min=0.0).pow(own("exponent"))
+                    spot.masked_fill_(on_axis < torch.deg2rad(own("cutoff")).cos(), 0.0)
+                    strength = strength * torch.where(is_spot, spot, 1.0)
+                direction = torch.where(is_far, direction, to_light)
+                distance = torch.where(is_far, endless, distance)
+                strength = torch.where(is_far, one, strength)
+            yield diffuse, specular, direction, distance, strength, own("castshadow") != 0
+        if self._headlight.active:
+            diffuse, specular = (
+                torch.tensor(color, dtype=torch.float32).view(3, 1, 1)
+                for color in (self._headlight.diffuse, self._headlight.specular)
+            )
+            # It shines along the optical axis.
+            direction = torch.tensor([0.0, 0.0, 1.0]).view(3, 1, 1)
+            yield diffuse, specular, direction, endless, one, torch.tensor(False)
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Return the products of vectors whose components come first."""
+    return torch.addcmul(a[0] * b[0], a[1], b[1]).addcmul_(a[2], b[2])
+
+
+# Textures.
+
 _RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 _SKYBOX = int(mujoco.mjtTexture.mjTEXTURE_SKYBOX)
 # Planes painted one by one: all pixels of an image at once. On the YAM task, whose ground fills
@@ -28,7 +230,6 @@ _SKYBOX = int(mujoco.mjtTexture.mjTEXTURE_SKYBOX)
 _MAX_PLANES = 2
 # The cosine above which a normal is that of an end of a cylinder.
 _END = 0.7071
-_TINY = 1e-6
 
 
 class Textures:
