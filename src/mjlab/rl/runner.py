@@ -40,11 +40,9 @@ from mjlab.rl.exporter_utils import (
 )
 from mjlab.rl.networks import (
     check_mini_batches,
-    check_networks,
-    check_symmetry,
-    settle_image_settings,
+    deduplicate_parameters,
+    prepare_train_cfg,
     shared_parameters_allowed,
-    train_once,
 )
 from mjlab.rl.replay import ReplayFiles, ReplayStorage
 from mjlab.rl.rsl import (
@@ -63,7 +61,6 @@ from mjlab.utils.signals import StopRequest
 from mjlab.utils.torch import torch_threads, using_torch_threads
 
 logger = logging.getLogger(__name__)
-_RECURRENT_KEYS = ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")
 
 # What `learn` ends with, in the order in which one outweighs another between processes.
 _REASONS = ("", "solved", "interrupted")
@@ -102,16 +99,12 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             ValueError: a network cannot take the observations that `obs_groups` gives it, or
                 `symmetry_cfg` has no function that makes mirror images.
         """
-        _drop_unused_keys(train_cfg)
-        observations = env.get_observations()
-        check_networks(observations, train_cfg)
-        settle_image_settings(observations, train_cfg)
-        check_symmetry(env, observations, train_cfg)
+        prepare_train_cfg(env, train_cfg)
         if train_cfg.get("torch_compile_mode"):
             enable_torch_compile()
         with _printing_to_log(), shared_parameters_allowed():
             super().__init__(env, train_cfg, log_dir, device)
-        train_once(self.alg.optimizer)
+        deduplicate_parameters(self.alg.optimizer)
         if not train_cfg.get("torch_compile_mode"):
             keep_compiler_out_of_step(self.alg.optimizer)
         self.logger: RunLogger = RunLogger(
@@ -755,20 +748,6 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     def _tell(self, event: str, *args: Any) -> None:
         for observer in self.observers:
             getattr(observer, event)(*args)
-
-
-def _drop_unused_keys(train_cfg: dict) -> None:
-    """Remove settings of models that rsl_rl's constructors take only where they are used."""
-    for name in ("actor", "critic", "student", "teacher"):
-        model = train_cfg.get(name)
-        if not isinstance(model, dict):
-            continue
-        for key in ("cnn_cfg", "distribution_cfg"):
-            if model.get(key, ...) is None:
-                del model[key]
-        if model.get("rnn_type", ...) is None:
-            for key in _RECURRENT_KEYS:
-                model.pop(key, None)
 
 
 @contextlib.contextmanager
