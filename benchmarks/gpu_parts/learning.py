@@ -116,5 +116,5 @@ def _is_solved(result: EvaluationResult) -> bool:
 
 
 def _shown(result: EvaluationResult) -> str:
-    errors = ", ".join(f"{name} {result.figure(name):.3f}" for name in _conditions())
+    errors = ", ".join(f"{name} {result.value(name):.3f}" for name in _conditions())
     return f"{errors}; return {result.mean_return:.0f}"

@@ -10,6 +10,7 @@ import pytest
 from commands import SMALL, TASK
 
 from mjlab.rl import MjlabOnPolicyRunner
+from mjlab.rl.divergence import RolloutWatch
 from mjlab.scripts.run_folder import NewRunFolder
 from mjlab.utils.os import create_locked, temporary_path
 
@@ -49,17 +50,17 @@ def test_a_run_that_fails_before_its_first_iteration_leaves_no_folder(attempt, m
         assert list(Path(self.logger.log_dir).iterdir())
         raise ValueError("not today")
 
-    monkeypatch.setattr(MjlabOnPolicyRunner, "_start", fail)
+    monkeypatch.setattr(MjlabOnPolicyRunner, "_initial_observations", fail)
     outcome, left = attempt()
     assert "not today" in outcome.message
     assert left == []
 
 
 def test_a_run_that_fails_later_keeps_its_folder(attempt, monkeypatch):
-    def fail(self, observations):
+    def fail(self):
         raise ValueError("not today")
 
-    monkeypatch.setattr(MjlabOnPolicyRunner, "_collect", fail)
+    monkeypatch.setattr(RolloutWatch, "start", fail)
     outcome, (run_dir,) = attempt()
     assert "not today" in outcome.message
     assert (run_dir / "run.json").is_file()
@@ -144,8 +145,8 @@ def test_a_folder_that_takes_no_more_is_told_without_tracebacks(tmp_path):
 def test_a_killed_writer_leaves_what_is_removed(tmp_path):
     (tmp_path / "old").mkdir()
     program = (
-        "import os, sys\nfrom mjlab.rl import checkpoint\n"
-        "checkpoint._write = lambda *_: os.kill(os.getpid(), 9)\n"
+        "import os, sys, torch\nfrom mjlab.rl import checkpoint\n"
+        "torch.save = lambda *_: os.kill(os.getpid(), 9)\n"
         "checkpoint.save_checkpoint({}, sys.argv[1])\n"
     )
     path = tmp_path / "old" / "model_1.pt"
