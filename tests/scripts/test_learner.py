@@ -74,7 +74,7 @@ def test_the_help_lists_the_flags_of_the_learner(run):
 def test_a_learner_that_does_not_exist_is_told_with_those_that_do(run, script):
     outcome = run(script, TASK, "--learner", "td3")
     assert outcome.status == 1
-    assert "Unknown learner 'td3'. Available: ppo, sac, distillation." in outcome.message
+    assert all(name in outcome.message for name in ("td3", "ppo", "sac", "distillation"))
 
 
 def test_counts_of_sac_are_checked(run):
