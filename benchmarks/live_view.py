@@ -31,7 +31,7 @@ from websockets.sync.client import connect
 
 from mjlab.rl.config import EvaluationCfg
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
-from mjlab.scripts import train_run
+from mjlab.scripts import train as train_run
 from mjlab.scripts.live import LiveView
 from mjlab.tasks.registry import load_runner_cls
 

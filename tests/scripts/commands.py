@@ -20,7 +20,7 @@ import pytest
 import torch
 
 from mjlab.rl.run_logger import IterationStats
-from mjlab.scripts import train_run
+from mjlab.scripts import train as train_run
 from mjlab.scripts.run_folder import checkpoints_in, read_run_info
 
 TASK = "Mjlab-Cartpole-Swingup"

@@ -22,7 +22,7 @@ SMALL = (
 _PATIENCE = 90.0
 _CONTEXT = multiprocessing.get_context("forkserver")
 _CONTEXT.set_forkserver_preload(
-    ["mjlab.scripts.train_run", "mjlab.rl.runner", "mjlab.envs.manager_based_rl_env", "mjlab.sim"]
+    ["mjlab.scripts.train", "mjlab.rl.runner", "mjlab.envs.manager_based_rl_env", "mjlab.sim"]
 )
 
 
@@ -164,7 +164,7 @@ def fail_while_training(folder: Path, rank: int) -> None:
 
 def fail_while_building(folder: Path, rank: int) -> None:
     """Let process 1 fail when it makes its environment."""
-    from mjlab.scripts import train_run
+    from mjlab.scripts import train as train_run
 
     build = train_run._build_env
 
@@ -178,7 +178,7 @@ def fail_while_building(folder: Path, rank: int) -> None:
 
 def count_lookups(folder: Path, rank: int) -> None:
     """Write down every look for the checkpoint to resume."""
-    from mjlab.scripts import train_run
+    from mjlab.scripts import train as train_run
 
     look = train_run.checkpoint_to_resume
 

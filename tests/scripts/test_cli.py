@@ -11,9 +11,11 @@ import pytest
 
 from mjlab.rl.checkpoint import CheckpointError
 from mjlab.scripts import cli
-from mjlab.scripts.cli import UserError, parse_flags, resolve_device, run_command, task_and_flags
+from mjlab.scripts.cli import run_command, task_and_flags
+from mjlab.scripts.flags import parse_flags, resolve_device
 from mjlab.sim.engine import EngineUnavailableError
 from mjlab.tasks.registry import UnknownTaskError
+from mjlab.utils.errors import UserError
 from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
 
 USAGE = "usage: try TASK [flags]"

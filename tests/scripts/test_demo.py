@@ -120,7 +120,7 @@ def test_a_policy_of_another_task_is_refused(run, go1_policy):
     [("linux", None, False), ("linux", ":1", True), ("darwin", None, True)],
 )
 def test_a_browser_is_opened_only_where_there_is_a_display(monkeypatch, platform, display, opened):
-    play_run = importlib.import_module("mjlab.scripts.play_run")
+    play_run = importlib.import_module("mjlab.scripts.play")
     monkeypatch.setattr(play_run.sys, "platform", platform)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     if display is None:

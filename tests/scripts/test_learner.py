@@ -19,12 +19,12 @@ from process_runs import ProcessRun
 
 from mjlab.rl.config import RslRlOffPolicyRunnerCfg
 from mjlab.rl.learners import with_learner
-from mjlab.scripts import train_run
-from mjlab.scripts.evaluate_run import EvaluateConfig
+from mjlab.scripts import train as train_run
+from mjlab.scripts.evaluate import EvaluateConfig
 from mjlab.scripts.live import Exchange, LiveJob, _env_to_show
 from mjlab.scripts.policy import _agent_cfg, env_cfg_of, load_policy, make_env
 from mjlab.scripts.run_folder import read_run_info, write_run_info
-from mjlab.scripts.train_run import TrainConfig, parse_train_flags
+from mjlab.scripts.train import TrainConfig, parse_train_flags
 from mjlab.tasks import registry
 from mjlab.utils.processes import ProcessRank
 
@@ -249,7 +249,7 @@ def test_the_live_view_shows_it(tmp_path, monkeypatch):
     import viser
 
     from mjlab.rl import MjlabOnPolicyRunner
-    from mjlab.scripts.live_view import _make_viewer
+    from mjlab.scripts.live import _make_viewer
 
     cfg = TrainConfig.from_task(TASK, learner="sac")
     cfg.env.scene.num_envs = 2

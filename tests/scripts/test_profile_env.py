@@ -7,8 +7,7 @@ import json
 import pytest
 from commands import TASK
 
-from mjlab.envs.profiling import StepProfile
-from mjlab.scripts.profile_env_run import _text, profile_figures
+from mjlab.scripts.profile_env import StepProfile, _text, profile_figures
 from mjlab.tasks.registry import list_tasks
 
 SMALL = ("--num-envs", "4", "--steps", "3", "--warm-up", "1", "--device", "cpu")

@@ -11,11 +11,11 @@ import pytest
 import yaml
 from commands import TASK
 
-from mjlab.scripts.evaluate_run import EvaluateConfig
+from mjlab.scripts.evaluate import EvaluateConfig
+from mjlab.scripts.flags import suggest_profile
 from mjlab.scripts.policy import env_cfg_of, parse_policy_flags, policy_env_cfg
-from mjlab.scripts.profiles import suggest_profile
 from mjlab.scripts.run_folder import read_run_info, write_run_info
-from mjlab.scripts.train_run import TrainConfig, parse_train_flags
+from mjlab.scripts.train import TrainConfig, parse_train_flags
 from mjlab.tasks import registry
 from mjlab.tasks.cpu_profile import cpu_profile
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from mjlab.scripts.cli import UserError
 from mjlab.scripts.run_folder import (
     checkpoints_in,
     named_checkpoint,
@@ -16,6 +15,7 @@ from mjlab.scripts.run_folder import (
     read_run_info,
     write_run_info,
 )
+from mjlab.utils.errors import UserError
 
 TASK = "My-Task"
 

@@ -8,12 +8,16 @@ import sys
 import numpy as np
 import pytest
 
-from mjlab.scripts.cli import UserError
-from mjlab.scripts.terrain_knobs import knobs_of, with_values
-from mjlab.scripts.terrain_page import TerrainPage
-from mjlab.scripts.terrain_scene import build_terrain_scene
-from mjlab.scripts.visualize_terrain import VisualizeTerrainConfig, run_visualize_terrain
+from mjlab.scripts.visualize_terrain import (
+    TerrainPage,
+    VisualizeTerrainConfig,
+    build_terrain_scene,
+    knobs_of,
+    run_visualize_terrain,
+    with_values,
+)
 from mjlab.terrains.config import ALL_TERRAIN_PRESETS, flat, hf_pyramid_slope, wave_terrain
+from mjlab.utils.errors import UserError
 
 
 @pytest.mark.parametrize("name", ALL_TERRAIN_PRESETS)

@@ -6,21 +6,31 @@ import copy
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import RslRlBaseRunnerCfg, RslRlDistillationRunnerCfg
 from mjlab.rl.learners import Learner, acting_cfg
-from mjlab.scripts.cli import BadCallError, UserError, is_given, tell
-from mjlab.scripts.profiles import parse_with_choices, profile_of_run
+from mjlab.scripts.flags import (
+    is_given,
+    parse_with_choices,
+    prepare_env_cfg,
+    profile_of_run,
+    with_task_options,
+)
 from mjlab.scripts.run_folder import (
     named_checkpoint,
     newest_checkpoint,
     read_agent_params,
     read_run_info,
 )
-from mjlab.scripts.task_options import prepare_env_cfg, with_task_options
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
+from mjlab.utils.errors import BadCallError, UserError
+from mjlab.utils.logging import print_notice
+from mjlab.viewer.base import ended, forget
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnvCfg
 
 # The classes of networks that a run's own settings may name. No others come from a file, because
 # rsl_rl would import and call whatever they name.
@@ -285,7 +295,7 @@ def _newest_checkpoint(task: str, flags: PolicyFlags) -> Path:
             f"No checkpoint was named, and {experiment} has none of {task}{by}. Run `train "
             f"{task}{choice}` first, or give --checkpoint-file or --wandb-run-path."
         )
-    tell(f"Checkpoint: {path}")
+    print_notice(f"Checkpoint: {path}")
     return path
 
 
@@ -412,3 +422,75 @@ def policy_env_cfg(task: str, profile: str | None, *, purpose: Purpose) -> Manag
         if prepare is not None:
             prepare(cfg)
     return cfg
+
+
+@dataclass(frozen=True)
+class VideoCfg:
+    """What a recording looks like."""
+
+    length: int = 200
+    """Frames, one an environment step."""
+    height: int | None = None
+    """Height in pixels; None keeps the task's."""
+    width: int | None = None
+    """Width in pixels; None keeps the task's."""
+    suffix: Literal["mp4", "gif"] = "mp4"
+    """Format of the file."""
+    camera: int | str | None = None
+    """Camera of the model, by name or index; None is the task's own view."""
+    num_envs: int | None = None
+    """Number of environments; None keeps the task's."""
+    engine: Any = None
+    """Physics engine; None keeps the task's."""
+    agent: str = "trained"
+    """Who acts where there is no checkpoint: `zero` or `random`."""
+    profile: str | None = None
+    """Profile of the task that the policy was trained with."""
+
+
+def record_policy(
+    task: str,
+    env_cfg: ManagerBasedRlEnvCfg,
+    checkpoint: Path | None,
+    folder: Path,
+    device: str,
+    video: VideoCfg | None = None,
+) -> Path | None:
+    """Record one clip into `folder` and return its path.
+
+    Raises:
+        RenderingUnavailableError: this machine cannot render; the message says what to install.
+    """
+    import torch
+
+    from mjlab.utils.wrappers.video_recorder import ClipWriter
+
+    video = video or VideoCfg()
+
+    env_cfg = copy.deepcopy(env_cfg)
+    env_cfg.viewer.height = video.height or env_cfg.viewer.height
+    env_cfg.viewer.width = video.width or env_cfg.viewer.width
+    env = make_env(
+        task,
+        env_cfg,
+        device,
+        video.num_envs,
+        video.engine,
+        render_mode="rgb_array",
+        profile=video.profile,
+    )
+    try:
+        policy = make_policy(task, env, video.agent, checkpoint, device, video.profile)
+        name = video.agent if checkpoint is None else checkpoint.stem
+        writer = ClipWriter(
+            folder / f"{task}-{name}.{video.suffix}", env.unwrapped.metadata["render_fps"]
+        )
+        with torch.inference_mode():
+            for _ in range(video.length):
+                forget(policy, ended(env.step(policy(env.get_observations()))))
+                writer.add(env.unwrapped.render(video.camera))
+        path = writer.close()
+    finally:
+        env.close()
+    print(f"Video: {path}")
+    return path
