@@ -38,7 +38,7 @@ from report import processor  # noqa: E402
 from solving import EVALUATION_SEED  # noqa: E402
 
 from mjlab.rl.plot import plot_curves  # noqa: E402
-from mjlab.scripts.flags import resolve_device  # noqa: E402
+from mjlab.scripts.devices import resolve_device  # noqa: E402
 from mjlab.scripts.reference import (  # noqa: E402
     DATA,
     ENDED,

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from mjlab.scripts import demo
-from mjlab.scripts.policy import load_policy, make_env, policy_env_cfg
+from mjlab.scripts.environments import make_env
+from mjlab.scripts.policy import load_policy, policy_env_cfg
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 
 GO1 = demo.DEMOS["go1"]

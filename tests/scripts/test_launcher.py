@@ -12,9 +12,10 @@ import torch
 from commands import TASK
 
 from mjlab.scripts import launcher
+from mjlab.scripts.devices import gpus_to_share, training_device
 from mjlab.scripts.launcher import launch_workers
 from mjlab.scripts.process_output import log_file, output_of
-from mjlab.scripts.train import TrainConfig, gpus_to_share, training_device
+from mjlab.scripts.train import TrainConfig
 from mjlab.utils.errors import UserError
 from mjlab.utils.processes import ProcessRank
 

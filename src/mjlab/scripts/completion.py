@@ -76,3 +76,10 @@ def command(argv: list[str], prog: str) -> None:
         print(scripts[argv[0]])
     else:
         raise BadCallError(f"{prog}: expected one of {', '.join(scripts)}, got {' '.join(argv)!r}.")
+
+
+def main() -> None:
+    """Entry point of `python -m mjlab.scripts.completion`."""
+    from mjlab.scripts.cli import run_alias
+
+    run_alias("completion")

@@ -9,12 +9,13 @@ from typing import Any
 
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.scripts.cli import run_alias
-from mjlab.scripts.flags import is_given, resolve_device
+from mjlab.scripts.devices import resolve_device
+from mjlab.scripts.environments import make_env
+from mjlab.scripts.flags import is_given
 from mjlab.scripts.policy import (
     PolicyFlags,
     env_cfg_of,
     find_checkpoint,
-    make_env,
     make_policy,
     parse_policy_flags,
     policy_env_cfg,

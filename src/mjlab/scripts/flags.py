@@ -35,7 +35,6 @@ from mjlab.tasks.registry import (
     load_options_cls,
     load_rl_cfg,
 )
-from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
 
 if TYPE_CHECKING:
@@ -119,31 +118,6 @@ def _with_explicit_switches(config_type: Any, flags: list[str]) -> list[str]:
         if flag.replace("_", "-") in switches and bare:
             explicit.append("True")
     return explicit
-
-
-def resolve_device(device: str | None) -> str:
-    """Return the torch device to use: the one asked for, else a GPU where there is one.
-
-    Raises:
-        UserError: a CUDA device without a usable GPU, or a name that torch does not know.
-    """
-    import torch
-
-    if device is None:
-        return "cuda:0" if torch.cuda.is_available() else "cpu"
-    try:
-        kind = torch.device(device).type
-    except RuntimeError as error:
-        raise UserError(
-            f"{device!r} is not a device. Use cpu, cuda, or cuda:0, cuda:1, ..."
-        ) from error
-    if kind == "cuda" and not torch.cuda.is_available():
-        raise UserError(
-            f"--device {device} was asked for, but torch finds no CUDA GPU here "
-            f"(torch {torch.__version__}). Use --device cpu, or install a driver and a CUDA build "
-            "of torch."
-        )
-    return "cuda:0" if device == "cuda" else device
 
 
 # Profile and learner.

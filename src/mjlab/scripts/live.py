@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     import viser
 
     from mjlab.rl import MjlabOnPolicyRunner
-    from mjlab.scripts.train import TrainConfig
+    from mjlab.scripts.train_config import TrainConfig
     from mjlab.viewer.base import EnvProtocol, PolicyProtocol
 
 

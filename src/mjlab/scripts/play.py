@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mjlab.compat import older_names
 from mjlab.scripts.cli import run_alias
-from mjlab.scripts.flags import resolve_device
+from mjlab.scripts.devices import resolve_device
+from mjlab.scripts.environments import make_env
 from mjlab.scripts.policy import (
     PolicyFlags,
     env_cfg_of,
     find_checkpoint,
     load_policy,
-    make_env,
     make_policy,
     parse_policy_flags,
 )

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import RslRlBaseRunnerCfg, RslRlDistillationRunnerCfg
 from mjlab.rl.learners import Learner, acting_cfg
+from mjlab.scripts.environments import make_env
 from mjlab.scripts.flags import (
     is_given,
     parse_with_choices,
@@ -348,37 +349,6 @@ def constant_policy(env: Any, kind: str) -> Any:
     return lambda observations: (
         2.0 * torch.rand(shape, dtype=torch.float32, device=env.device) - 1.0
     )
-
-
-def make_env(
-    task: str,
-    cfg: ManagerBasedRlEnvCfg,
-    device: str,
-    num_envs: int | None = None,
-    engine: Any = None,
-    *,
-    seed: int | None = None,
-    render_mode: str | None = None,
-    profile: str | None = None,
-) -> Any:
-    """Return the wrapped environment of `cfg`; what is None is left as `cfg` has it.
-
-    Actions are clipped as the learner's config of the task says, under `profile`.
-    """
-    from mjlab.envs import ManagerBasedRlEnv
-    from mjlab.rl import RslRlVecEnvWrapper
-    from mjlab.utils.torch import prepare_torch
-
-    prepare_torch(device)
-    cfg = copy.deepcopy(cfg)
-    cfg.seed = cfg.seed if seed is None else seed
-    if num_envs is not None:
-        cfg.scene.num_envs = num_envs
-    if engine is not None:
-        cfg.sim.engine = engine
-    env = ManagerBasedRlEnv(cfg, device=device, render_mode=render_mode)
-    clip_actions = load_rl_cfg(task, profile=profile).clip_actions
-    return RslRlVecEnvWrapper(env, clip_actions=clip_actions)
 
 
 def env_cfg_of(

@@ -13,12 +13,12 @@ import torch
 
 from mjlab.managers.null_managers import NullManager
 from mjlab.scripts.cli import run_alias
-from mjlab.scripts.flags import resolve_device
+from mjlab.scripts.devices import resolve_device
+from mjlab.scripts.environments import make_env
 from mjlab.scripts.policy import (
     PolicyFlags,
     env_cfg_of,
     find_checkpoint,
-    make_env,
     make_policy,
     parse_policy_flags,
 )

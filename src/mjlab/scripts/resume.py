@@ -15,10 +15,11 @@ from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
 from mjlab.utils.processes import process_rank
+from mjlab.utils.random import draw_seed
 
 if TYPE_CHECKING:
     from mjlab.rl import MjlabOnPolicyRunner
-    from mjlab.scripts.train import TrainConfig
+    from mjlab.scripts.train_config import TrainConfig
 
 
 def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
@@ -143,12 +144,16 @@ def keep_number_of_environments(task: str, cfg: TrainConfig, checkpoint: Path) -
     print(f"Resuming with {count} environments, as before; --num-envs gives another number.")
 
 
-def seed_to_resume(checkpoint: Path | None) -> int | None:
-    """Return the seed of the run of `checkpoint`; None if there is none, or nothing says it."""
-    if checkpoint is None:
-        return None
-    seed: Any = read_agent_params(checkpoint.parent).get("seed")
-    return seed if isinstance(seed, int) and seed >= 0 else None
+def choose_seed(checkpoint: Path | None) -> int:
+    """Return the seed of the resumed run, or a new one, and print which."""
+    if checkpoint is not None:
+        seed: Any = read_agent_params(checkpoint.parent).get("seed")
+        if isinstance(seed, int) and seed >= 0:
+            print(f"Seed:    {seed}, as before; --agent.seed gives another")
+            return seed
+    seed = draw_seed()
+    print(f"Seed:    {seed}, drawn; --agent.seed {seed} repeats the run")
+    return seed
 
 
 def is_finished(cfg: TrainConfig, runner: MjlabOnPolicyRunner, checkpoint: Path) -> bool:

@@ -70,7 +70,8 @@ def _take_count(flags: list[str]) -> tuple[int, list[str]]:
 
 def _experiment(task: str, flags: list[str], prog: str) -> Path:
     """Return the folder that the runs go to. Mistaken flags end the command here, `--help` too."""
-    from mjlab.scripts.train import check_typed_flags, parse_train_flags
+    from mjlab.scripts.train import parse_train_flags
+    from mjlab.scripts.train_config import check_typed_flags
 
     cfg = parse_train_flags(task, flags, prog=f"{prog} {task}")
     check_typed_flags(cfg, flags)

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mjlab.scripts.cli import run_alias
-from mjlab.scripts.flags import parse_flags, resolve_device
+from mjlab.scripts.devices import resolve_device
+from mjlab.scripts.flags import parse_flags
 from mjlab.scripts.reference import (
     DATA,
     ENDED,
@@ -32,7 +33,7 @@ from mjlab.utils.errors import BadCallError, UserError
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from mjlab.scripts.train import TrainConfig
+    from mjlab.scripts.train_config import TrainConfig
 
 _OUTSIDE = 1
 # Rows of the printed table.

@@ -225,7 +225,7 @@ def test_list_envs_shows_profiles_and_imports_no_torch(run):
     (line,) = (line for line in lines if PLAIN in line)
     assert line.endswith(PLAIN)
     code = (
-        "import sys\nfrom mjlab.scripts.list_envs import _command\n_command([])\n"
+        "import sys\nfrom mjlab.scripts.list_envs import command\ncommand([], 'list-envs')\n"
         "assert not {'torch', 'mujoco'} & set(sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -66,7 +66,7 @@ def test_too_little_memory_is_one_message(run, tmp_path, monkeypatch, error):
     def build(*args):
         raise error
 
-    monkeypatch.setattr("mjlab.scripts.train._build_env", build)
+    monkeypatch.setattr("mjlab.scripts.train.training_env", build)
     outcome = run("train", TASK, *SMALL, "--log-root", str(tmp_path))
     assert outcome.status == 1
     assert "Memory" in outcome.message

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mjlab.scripts.policy import make_env
+from mjlab.scripts.environments import make_env
 from mjlab.scripts.train import TrainConfig, launch_training
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 
