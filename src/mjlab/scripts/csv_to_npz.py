@@ -33,14 +33,12 @@ if TYPE_CHECKING:
 
     from mjlab.entity import Entity
     from mjlab.tasks.tracking.motion_file import Motion
-
-
 _WANDB_PROJECT = "csv_to_npz"
 _ARTIFACT_TYPE = "motions"
-
 # As mjlab 1.6 calls it, so that its `play` finds it.
 _ARTIFACT_FILE = "motion.npz"
 _VIDEO_SIZE = (480, 640)
+__getattr__ = older_names(__name__)
 
 
 @dataclass
@@ -74,6 +72,11 @@ class CsvToNpzConfig:
     device: str | None = None
     """Without effect, for scripts that were written for mjlab 1.6: the conversion is a matter of
     seconds on the CPU."""
+
+
+def command(argv: list[str], prog: str) -> None:
+    """Run `mjlab csv-to-npz`."""
+    convert(parse_flags(CsvToNpzConfig, CsvToNpzConfig(), argv, prog=prog))
 
 
 def convert(cfg: CsvToNpzConfig) -> Path:
@@ -230,6 +233,25 @@ def _send(path: Path, name: str) -> None:
         run.finish()
 
 
+# The page.
+
+
+def show_motion(motion: Motion, model: mujoco.MjModel, host: str, port: int) -> None:
+    """Serve the page until Ctrl-C."""
+    server = serve_page(host, port)
+    page = MotionPage(server, motion, model)
+    print(f"Open {page_url(server)} in a browser. Ctrl-C ends.", flush=True)
+    last = time.perf_counter()
+    try:
+        while True:
+            now = time.perf_counter()
+            page.advance(now - last)
+            last = now
+            time.sleep(1.0 / 50.0)
+    finally:
+        server.stop()
+
+
 class MotionPage:
     """Shows a robot on a frame of a motion, which runs by itself or follows a slider."""
 
@@ -272,30 +294,6 @@ class MotionPage:
         if event.client is not None:
             self._playing.value = False
             self._frame = float(self._slider.value)
-
-
-def show_motion(motion: Motion, model: mujoco.MjModel, host: str, port: int) -> None:
-    """Serve the page until Ctrl-C."""
-    server = serve_page(host, port)
-    page = MotionPage(server, motion, model)
-    print(f"Open {page_url(server)} in a browser. Ctrl-C ends.", flush=True)
-    last = time.perf_counter()
-    try:
-        while True:
-            now = time.perf_counter()
-            page.advance(now - last)
-            last = now
-            time.sleep(1.0 / 50.0)
-    finally:
-        server.stop()
-
-
-__getattr__ = older_names(__name__)
-
-
-def command(argv: list[str], prog: str) -> None:
-    """Run `mjlab csv-to-npz`."""
-    convert(parse_flags(CsvToNpzConfig, CsvToNpzConfig(), argv, prog=prog))
 
 
 def main() -> None:

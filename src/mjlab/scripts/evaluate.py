@@ -39,6 +39,13 @@ class EvaluateConfig(PolicyFlags):
     """Print only JSON."""
 
 
+def command(argv: list[str], prog: str) -> None:
+    """Run `evaluate`."""
+    task, *flags = argv
+    cfg = parse_policy_flags(EvaluateConfig, flags, task, prog, purpose="evaluate")
+    run_evaluate(task, cfg, keep_num_envs=is_given("--env.scene.num-envs", flags))
+
+
 def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False) -> dict[str, Any]:
     """Score a policy of `task`, print the figures, and return them.
 
@@ -137,13 +144,6 @@ def _interval(bounds: Sequence[float] | None, form: str) -> str:
         return "no interval"
     low, high = bounds
     return f"95 % interval [{low:{form}}, {high:{form}}]"
-
-
-def command(argv: list[str], prog: str) -> None:
-    """Run `evaluate`."""
-    task, *flags = argv
-    cfg = parse_policy_flags(EvaluateConfig, flags, task, prog, purpose="evaluate")
-    run_evaluate(task, cfg, keep_num_envs=is_given("--env.scene.num-envs", flags))
 
 
 def main() -> None:

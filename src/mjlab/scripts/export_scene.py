@@ -21,10 +21,9 @@ if TYPE_CHECKING:
     from mjlab.entity import EntityCfg
     from mjlab.scene import Scene, SceneCfg
     from mjlab.sim import MujocoCfg
-
-
 ROBOTS = {"g1": "get_g1_robot_cfg", "go1": "get_go1_robot_cfg", "yam": "get_yam_robot_cfg"}
 """Short names of robots, and the functions of `mjlab.asset_zoo.robots` that configure them."""
+
 _XML, _ASSETS = "scene.xml", "assets"
 
 
@@ -38,6 +37,13 @@ class ExportSceneConfig:
     """Write the archive `<output_dir>.zip` instead of a folder."""
     overwrite: bool = False
     """Replace an earlier export at that place; other files are left alone."""
+
+
+def command(argv: list[str], prog: str) -> None:
+    """Run `export-scene`."""
+    target, *flags = argv
+    cfg = parse_flags(ExportSceneConfig, ExportSceneConfig(), flags, f"{prog} TARGET")
+    run_export_scene(target, cfg)
 
 
 def run_export_scene(target: str, cfg: ExportSceneConfig) -> Path:
@@ -60,57 +66,6 @@ def run_export_scene(target: str, cfg: ExportSceneConfig) -> Path:
         _write_folder(scene, folder)
     print(f"Wrote {result if cfg.zip else folder / _XML}.")
     return result
-
-
-def _build(scene_cfg: SceneCfg, options: MujocoCfg) -> Scene:
-    from mjlab.scene import Scene
-
-    scene = Scene(scene_cfg, "cpu")
-    target: Any = SimpleNamespace(opt=scene.spec.option)
-    scene.report_overruled_options(options)
-    options.apply(target)
-    return scene
-
-
-def _folder(cfg: ExportSceneConfig) -> Path:
-    folder = Path(cfg.output_dir)
-    if not cfg.zip:
-        return folder
-    if folder.suffix == ".zip":
-        return folder.with_suffix("")
-    # An archive needs a name, which these paths do not say: `.`, `..`, `/`.
-    if folder.name in ("", ".."):
-        folder = folder.resolve()
-    if not folder.name:
-        raise UserError(f"--output-dir {cfg.output_dir} has no name that an archive could have.")
-    return folder
-
-
-def _check_place(result: Path, cfg: ExportSceneConfig) -> None:
-    if not cfg.zip and result.exists() and not result.is_dir():
-        raise UserError(f"{result} is a file. Choose another --output-dir.")
-    if cfg.overwrite or not result.exists():
-        return
-    if result.is_dir() and not any(result.iterdir()):
-        return
-    what = f"The archive {result} exists" if cfg.zip else f"The folder {result} is not empty"
-    raise UserError(
-        f"{what}. Choose another --output-dir, or give --overwrite True to replace an earlier "
-        "export there."
-    )
-
-
-def _write_folder(scene: Scene, folder: Path) -> None:
-    """Write beside the folder first, so that it never holds half an export."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".export-") as temporary:
-        made = Path(temporary) / "scene"
-        scene.write(made)
-        if (folder / _ASSETS).exists():
-            (folder / _ASSETS).rename(Path(temporary) / "earlier")
-        for name in (_ASSETS, _XML):
-            if (made / name).exists():
-                (made / name).replace(folder / name)
 
 
 def _load(target: str) -> tuple[SceneCfg, MujocoCfg]:
@@ -172,11 +127,55 @@ def _from_function(target: str) -> EntityCfg:
     return made
 
 
-def command(argv: list[str], prog: str) -> None:
-    """Run `export-scene`."""
-    target, *flags = argv
-    cfg = parse_flags(ExportSceneConfig, ExportSceneConfig(), flags, f"{prog} TARGET")
-    run_export_scene(target, cfg)
+def _build(scene_cfg: SceneCfg, options: MujocoCfg) -> Scene:
+    from mjlab.scene import Scene
+
+    scene = Scene(scene_cfg, "cpu")
+    target: Any = SimpleNamespace(opt=scene.spec.option)
+    scene.report_overruled_options(options)
+    options.apply(target)
+    return scene
+
+
+def _folder(cfg: ExportSceneConfig) -> Path:
+    folder = Path(cfg.output_dir)
+    if not cfg.zip:
+        return folder
+    if folder.suffix == ".zip":
+        return folder.with_suffix("")
+    # An archive needs a name, which these paths do not say: `.`, `..`, `/`.
+    if folder.name in ("", ".."):
+        folder = folder.resolve()
+    if not folder.name:
+        raise UserError(f"--output-dir {cfg.output_dir} has no name that an archive could have.")
+    return folder
+
+
+def _check_place(result: Path, cfg: ExportSceneConfig) -> None:
+    if not cfg.zip and result.exists() and not result.is_dir():
+        raise UserError(f"{result} is a file. Choose another --output-dir.")
+    if cfg.overwrite or not result.exists():
+        return
+    if result.is_dir() and not any(result.iterdir()):
+        return
+    what = f"The archive {result} exists" if cfg.zip else f"The folder {result} is not empty"
+    raise UserError(
+        f"{what}. Choose another --output-dir, or give --overwrite True to replace an earlier "
+        "export there."
+    )
+
+
+def _write_folder(scene: Scene, folder: Path) -> None:
+    """Write beside the folder first, so that it never holds half an export."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".export-") as temporary:
+        made = Path(temporary) / "scene"
+        scene.write(made)
+        if (folder / _ASSETS).exists():
+            (folder / _ASSETS).rename(Path(temporary) / "earlier")
+        for name in (_ASSETS, _XML):
+            if (made / name).exists():
+                (made / name).replace(folder / name)
 
 
 def main() -> None:

@@ -26,6 +26,7 @@ from mjlab.viewer.page_server import check_address
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
+__getattr__ = older_names(__name__)
 
 
 @dataclass
@@ -59,6 +60,12 @@ class PlayConfig(PolicyFlags):
     """Open the page in this machine's browser, if there is a display."""
     no_terminations: bool = False
     """Switch off every termination, the time limit included."""
+
+
+def command(argv: list[str], prog: str) -> None:
+    """Run `play`."""
+    task, *flags = argv
+    run_play(task, parse_policy_flags(PlayConfig, flags, task, prog, purpose="play"))
 
 
 def run_play(task: str, cfg: PlayConfig) -> None:
@@ -174,15 +181,6 @@ def _record(
             profile=cfg.profile,
         ),
     )
-
-
-__getattr__ = older_names(__name__)
-
-
-def command(argv: list[str], prog: str) -> None:
-    """Run `play`."""
-    task, *flags = argv
-    run_play(task, parse_policy_flags(PlayConfig, flags, task, prog, purpose="play"))
 
 
 def main() -> None:

@@ -219,7 +219,7 @@ def newest_checkpoint(experiment: Path, task: str, learner: str | None = None) -
     return None
 
 
-def named_checkpoint(path: Path, task: str) -> Path:
+def resolve_checkpoint(path: Path, task: str) -> Path:
     """Return the checkpoint at `path`, which may leave out the run's folder.
 
     `logs/rsl_rl/cartpole/model_500.pt` is then that file of the newest run of `task`, or the last

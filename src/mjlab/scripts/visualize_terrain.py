@@ -24,154 +24,72 @@ from mjlab.viewer.viser.scene import MjlabViserScene
 if TYPE_CHECKING:
     from mjlab.entity import EntityCfg
     from mjlab.terrains import SubTerrainCfg
-
-
 RobotName = Literal["unitree_go1", "unitree_g1", "none"]
 Kind = Literal["number", "count", "range", "switch", "choice"]
-
-# What the page, not a knob, decides, or what no slider can express.
-_NOT_KNOBS = {"proportion", "size", "flat_patch_sampling"}
-
+# What the page, not a control, decides, or what no slider can express.
+_NOT_CONTROLS = {"proportion", "size", "flat_patch_sampling"}
 # Sizes of pixels: near 0 a height field would have millions of them.
 _PIXELS = {"horizontal_scale", "vertical_scale", "resolution"}
-
-
-@dataclass(frozen=True)
-class Knob:
-    """One field of a config, and how it is shown."""
-
-    field: str
-    """Name of the field."""
-    kind: Kind
-    """A float, an int, a pair of floats, a bool, or one of several words."""
-    value: Any
-    """What it is now."""
-    low: float = 0.0
-    """Lowest value of a slider."""
-    high: float = 1.0
-    """Highest value of a slider."""
-    options: tuple[str, ...] = ()
-    """The words of a choice."""
-
-
-def knobs_of(cfg: SubTerrainCfg) -> list[Knob]:
-    """Return the knobs of a config, in the order of its fields. Fields that are None have none."""
-    hints = typing.get_type_hints(type(cfg))
-    knobs = []
-    for field in dataclasses.fields(cfg):
-        if field.name in _NOT_KNOBS:
-            continue
-        knob = _knob(field.name, getattr(cfg, field.name), hints[field.name])
-        if knob is not None:
-            knobs.append(knob)
-    return knobs
-
-
-def _knob(name: str, value: Any, hint: Any) -> Knob | None:
-    if isinstance(value, bool):
-        return Knob(name, "switch", value)
-    if typing.get_origin(hint) is Literal:
-        return Knob(name, "choice", value, options=typing.get_args(hint))
-    if isinstance(value, int):
-        return Knob(name, "count", value, 1, 3 * max(value, 1))
-    if isinstance(value, float):
-        if name in _PIXELS:
-            return Knob(name, "number", value, value / 2, 4 * value)
-        return Knob(name, "number", value, min(0.0, 2 * value), max(1.0, 2 * value))
-    if isinstance(value, tuple) and len(value) == 2:
-        low, high = value
-        return Knob(name, "range", value, min(0.0, 2 * low), max(2 * high, 0.1))
-    return None
-
-
-def with_values(cfg: SubTerrainCfg, values: dict[str, Any]) -> SubTerrainCfg:
-    """Return a copy of the config with the values of knobs."""
-    typed = {name: tuple(v) if isinstance(v, (list, tuple)) else v for name, v in values.items()}
-    return dataclasses.replace(cfg, **typed)
-
-
-@dataclass(frozen=True)
-class TerrainScene:
-    """A compiled terrain with one robot, and where to draw the robot."""
-
-    model: mujoco.MjModel
-    """The terrain, and the robot if there is one."""
-    origins: np.ndarray
-    """(levels, kinds, 3) spawn points."""
-    num_polygons: int
-    """Triangles of the terrain's surface."""
-
-    def poses(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return (n, nbody, 3) positions and (n, nbody, 3, 3) rotations, one for each origin."""
-        data = mujoco.MjData(self.model)
-        if self.model.nkey:
-            mujoco.mj_resetDataKeyframe(self.model, data, 0)
-        mujoco.mj_kinematics(self.model, data)
-        origins = self.origins.reshape(-1, 3)
-        positions = np.repeat(data.xpos[None], len(origins), axis=0)
-        # The world and the terrain stay where they are.
-        moving = self.model.body_weldid > 0
-        positions[:, moving] += origins[:, None]
-        return positions, np.repeat(data.xmat.reshape(1, -1, 3, 3), len(origins), axis=0)
-
-
-def build_terrain_scene(
-    kinds: dict[str, SubTerrainCfg], size: float, num_levels: int, seed: int, robot: RobotName
-) -> TerrainScene:
-    """Build a grid with one column for each kind and rows of rising difficulty.
-
-    Args:
-        kinds: Sub-terrains by name.
-        size: Extent of each cell, in metres.
-        num_levels: Number of rows.
-        seed: Seed of the terrain.
-        robot: Robot to place.
-
-    Raises:
-        ValueError: the terrain cannot be built.
-    """
-    from mjlab.scene import Scene, SceneCfg
-    from mjlab.terrains import TerrainEntityCfg, TerrainGeneratorCfg
-
-    generator = TerrainGeneratorCfg(
-        seed=seed,
-        curriculum=True,
-        size=(size, size),
-        num_rows=num_levels,
-        border_width=1.0,
-        sub_terrains=kinds,
-        add_lights=True,
-    )
-    terrain = TerrainEntityCfg(terrain_type="generator", terrain_generator=generator)
-    entities = {} if robot == "none" else {"robot": _robot_cfg(robot)}
-    scene = Scene(SceneCfg(terrain=terrain, entities=entities), "cpu")
-    model = scene.compile()
-    return TerrainScene(model, scene["terrain"].terrain_origins.numpy(), count_polygons(model))
-
-
-def _robot_cfg(robot: RobotName) -> EntityCfg:
-    from mjlab.asset_zoo import robots
-
-    return robots.get_go1_robot_cfg() if robot == "unitree_go1" else robots.get_g1_robot_cfg()
-
-
-def count_polygons(model: mujoco.MjModel) -> int:
-    """Return the number of triangles of the geoms of the body `terrain`."""
-    total = 0
-    for geom in np.flatnonzero(model.geom_bodyid == model.body("terrain").id):
-        kind, shape = model.geom_type[geom], model.geom_dataid[geom]
-        if kind == mujoco.mjtGeom.mjGEOM_HFIELD:
-            total += 2 * int((model.hfield_nrow[shape] - 1) * (model.hfield_ncol[shape] - 1))
-        elif kind == mujoco.mjtGeom.mjGEOM_MESH:
-            total += int(model.mesh_facenum[shape])
-        else:
-            # A box.
-            total += 12
-    return total
-
-
 ALL = "all"
 ROBOTS: tuple[RobotName, ...] = ("unitree_go1", "unitree_g1", "none")
+
+
+@dataclass(frozen=True)
+class VisualizeTerrainConfig:
+    """Flags of `visualize_terrain`."""
+
+    terrain: Annotated[str, tyro.conf.Positional] = "pyramid_stairs"
+    """A preset of `mjlab.terrains.config`, or `all`."""
+    num_levels: int = 5
+    """Number of difficulties, from 0 to 1."""
+    size: float = 8.0
+    """Extent of each terrain along x and y, in metres."""
+    seed: int = 0
+    """Seed of the terrain."""
+    robot: RobotName = "unitree_go1"
+    """Robot to place at each start, for scale."""
+    host: str = "127.0.0.1"
+    """Address to serve on; `0.0.0.0` serves the whole network."""
+    port: int = 8080
+    """Port to serve on; the next free one where it is taken."""
+
+
+def command(argv: list[str], prog: str) -> None:
+    """Run `mjlab visualize-terrain`."""
+    cfg = tyro.cli(VisualizeTerrainConfig, args=argv, prog=prog, config=mjlab.TYRO_FLAGS)
+    run_visualize_terrain(cfg)
+
+
+def run_visualize_terrain(cfg: VisualizeTerrainConfig) -> None:
+    """Serve the page until Ctrl-C.
+
+    Raises:
+        UserError: no such preset, or figures that no terrain can have.
+        ValueError: the page cannot be served at that address.
+    """
+    from mjlab.viewer.page_server import check_address, page_url, serve_page
+
+    check_address(cfg.host, cfg.port, "--")
+    from mjlab.terrains.config import ALL_TERRAIN_PRESETS
+
+    if cfg.terrain != "all" and cfg.terrain not in ALL_TERRAIN_PRESETS:
+        raise UserError(
+            f"There is no terrain preset {cfg.terrain!r}. Choose from: all, "
+            f"{', '.join(ALL_TERRAIN_PRESETS)}."
+        )
+    if not 1 <= cfg.num_levels <= 10 or not 4.0 <= cfg.size <= 16.0 or cfg.seed < 0:
+        raise UserError(
+            f"num_levels is {cfg.num_levels}, size {cfg.size} and seed {cfg.seed}; they must be "
+            "from 1 to 10, from 4 to 16 m, and not negative."
+        )
+
+    server = serve_page(cfg.host, cfg.port)
+    page = TerrainPage(server, cfg.terrain, cfg.num_levels, cfg.size, cfg.seed, cfg.robot)
+    print(f"Serving the terrain on {page_url(server)} (Ctrl-C stops).", flush=True)
+    try:
+        page.run()
+    finally:
+        server.stop()
 
 
 class TerrainPage:
@@ -295,81 +213,163 @@ class TerrainPage:
             self._handles, self._preset = {}, self._terrain.value
             if self._preset == ALL:
                 return
-            for knob in knobs_of(ALL_TERRAIN_PRESETS[self._preset]()):
-                handle = self._add_knob(knob)
+            for control in controls_of(ALL_TERRAIN_PRESETS[self._preset]()):
+                handle = self._add_control(control)
                 handle.on_update(self._ask)
-                self._handles[knob.field] = handle
+                self._handles[control.field] = handle
 
-    def _add_knob(self, knob: Knob) -> Any:
-        gui, label = self.server.gui, knob.field
-        if knob.kind == "switch":
-            return gui.add_checkbox(label, knob.value)
-        if knob.kind == "choice":
-            return gui.add_dropdown(label, knob.options, initial_value=knob.value)
-        if knob.kind == "count":
-            return gui.add_slider(label, int(knob.low), int(knob.high), 1, knob.value)
-        step = (knob.high - knob.low) / 200
-        if knob.kind == "range":
-            return gui.add_multi_slider(label, knob.low, knob.high, step, knob.value)
-        return gui.add_slider(label, knob.low, knob.high, step, knob.value)
+    def _add_control(self, control: FieldControl) -> Any:
+        gui, label = self.server.gui, control.field
+        if control.kind == "switch":
+            return gui.add_checkbox(label, control.value)
+        if control.kind == "choice":
+            return gui.add_dropdown(label, control.options, initial_value=control.value)
+        if control.kind == "count":
+            return gui.add_slider(label, int(control.low), int(control.high), 1, control.value)
+        step = (control.high - control.low) / 200
+        if control.kind == "range":
+            return gui.add_multi_slider(label, control.low, control.high, step, control.value)
+        return gui.add_slider(label, control.low, control.high, step, control.value)
+
+
+# The terrain.
 
 
 @dataclass(frozen=True)
-class VisualizeTerrainConfig:
-    """Flags of `visualize_terrain`."""
+class TerrainScene:
+    """A compiled terrain with one robot, and where to draw the robot."""
 
-    terrain: Annotated[str, tyro.conf.Positional] = "pyramid_stairs"
-    """A preset of `mjlab.terrains.config`, or `all`."""
-    num_levels: int = 5
-    """Number of difficulties, from 0 to 1."""
-    size: float = 8.0
-    """Extent of each terrain along x and y, in metres."""
-    seed: int = 0
-    """Seed of the terrain."""
-    robot: RobotName = "unitree_go1"
-    """Robot to place at each start, for scale."""
-    host: str = "127.0.0.1"
-    """Address to serve on; `0.0.0.0` serves the whole network."""
-    port: int = 8080
-    """Port to serve on; the next free one where it is taken."""
+    model: mujoco.MjModel
+    """The terrain, and the robot if there is one."""
+    origins: np.ndarray
+    """(levels, kinds, 3) spawn points."""
+    num_polygons: int
+    """Triangles of the terrain's surface."""
+
+    def poses(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (n, nbody, 3) positions and (n, nbody, 3, 3) rotations, one for each origin."""
+        data = mujoco.MjData(self.model)
+        if self.model.nkey:
+            mujoco.mj_resetDataKeyframe(self.model, data, 0)
+        mujoco.mj_kinematics(self.model, data)
+        origins = self.origins.reshape(-1, 3)
+        positions = np.repeat(data.xpos[None], len(origins), axis=0)
+        # The world and the terrain stay where they are.
+        moving = self.model.body_weldid > 0
+        positions[:, moving] += origins[:, None]
+        return positions, np.repeat(data.xmat.reshape(1, -1, 3, 3), len(origins), axis=0)
 
 
-def command(argv: list[str], prog: str) -> None:
-    """Run `mjlab visualize-terrain`."""
-    cfg = tyro.cli(VisualizeTerrainConfig, args=argv, prog=prog, config=mjlab.TYRO_FLAGS)
-    run_visualize_terrain(cfg)
+def build_terrain_scene(
+    kinds: dict[str, SubTerrainCfg], size: float, num_levels: int, seed: int, robot: RobotName
+) -> TerrainScene:
+    """Build a grid with one column for each kind and rows of rising difficulty.
 
-
-def run_visualize_terrain(cfg: VisualizeTerrainConfig) -> None:
-    """Serve the page until Ctrl-C.
+    Args:
+        kinds: Sub-terrains by name.
+        size: Extent of each cell, in metres.
+        num_levels: Number of rows.
+        seed: Seed of the terrain.
+        robot: Robot to place.
 
     Raises:
-        UserError: no such preset, or figures that no terrain can have.
-        ValueError: the page cannot be served at that address.
+        ValueError: the terrain cannot be built.
     """
-    from mjlab.viewer.page_server import check_address, page_url, serve_page
+    from mjlab.scene import Scene, SceneCfg
+    from mjlab.terrains import TerrainEntityCfg, TerrainGeneratorCfg
 
-    check_address(cfg.host, cfg.port, "--")
-    from mjlab.terrains.config import ALL_TERRAIN_PRESETS
+    generator = TerrainGeneratorCfg(
+        seed=seed,
+        curriculum=True,
+        size=(size, size),
+        num_rows=num_levels,
+        border_width=1.0,
+        sub_terrains=kinds,
+        add_lights=True,
+    )
+    terrain = TerrainEntityCfg(terrain_type="generator", terrain_generator=generator)
+    entities = {} if robot == "none" else {"robot": _robot_cfg(robot)}
+    scene = Scene(SceneCfg(terrain=terrain, entities=entities), "cpu")
+    model = scene.compile()
+    return TerrainScene(model, scene["terrain"].terrain_origins.numpy(), count_polygons(model))
 
-    if cfg.terrain != "all" and cfg.terrain not in ALL_TERRAIN_PRESETS:
-        raise UserError(
-            f"There is no terrain preset {cfg.terrain!r}. Choose from: all, "
-            f"{', '.join(ALL_TERRAIN_PRESETS)}."
-        )
-    if not 1 <= cfg.num_levels <= 10 or not 4.0 <= cfg.size <= 16.0 or cfg.seed < 0:
-        raise UserError(
-            f"num_levels is {cfg.num_levels}, size {cfg.size} and seed {cfg.seed}; they must be "
-            "from 1 to 10, from 4 to 16 m, and not negative."
-        )
 
-    server = serve_page(cfg.host, cfg.port)
-    page = TerrainPage(server, cfg.terrain, cfg.num_levels, cfg.size, cfg.seed, cfg.robot)
-    print(f"Serving the terrain on {page_url(server)} (Ctrl-C stops).", flush=True)
-    try:
-        page.run()
-    finally:
-        server.stop()
+def _robot_cfg(robot: RobotName) -> EntityCfg:
+    from mjlab.asset_zoo import robots
+
+    return robots.get_go1_robot_cfg() if robot == "unitree_go1" else robots.get_g1_robot_cfg()
+
+
+def count_polygons(model: mujoco.MjModel) -> int:
+    """Return the number of triangles of the geoms of the body `terrain`."""
+    total = 0
+    for geom in np.flatnonzero(model.geom_bodyid == model.body("terrain").id):
+        kind, shape = model.geom_type[geom], model.geom_dataid[geom]
+        if kind == mujoco.mjtGeom.mjGEOM_HFIELD:
+            total += 2 * int((model.hfield_nrow[shape] - 1) * (model.hfield_ncol[shape] - 1))
+        elif kind == mujoco.mjtGeom.mjGEOM_MESH:
+            total += int(model.mesh_facenum[shape])
+        else:
+            # A box.
+            total += 12
+    return total
+
+
+# Fields that can be changed on the page.
+
+
+@dataclass(frozen=True)
+class FieldControl:
+    """One field of a config, and how it is shown."""
+
+    field: str
+    """Name of the field."""
+    kind: Kind
+    """A float, an int, a pair of floats, a bool, or one of several words."""
+    value: Any
+    """What it is now."""
+    low: float = 0.0
+    """Lowest value of a slider."""
+    high: float = 1.0
+    """Highest value of a slider."""
+    options: tuple[str, ...] = ()
+    """The words of a choice."""
+
+
+def controls_of(cfg: SubTerrainCfg) -> list[FieldControl]:
+    """Return the controls of a config, in the order of its fields. Fields that are None have none."""
+    hints = typing.get_type_hints(type(cfg))
+    controls = []
+    for field in dataclasses.fields(cfg):
+        if field.name in _NOT_CONTROLS:
+            continue
+        control = _control(field.name, getattr(cfg, field.name), hints[field.name])
+        if control is not None:
+            controls.append(control)
+    return controls
+
+
+def _control(name: str, value: Any, hint: Any) -> FieldControl | None:
+    if isinstance(value, bool):
+        return FieldControl(name, "switch", value)
+    if typing.get_origin(hint) is Literal:
+        return FieldControl(name, "choice", value, options=typing.get_args(hint))
+    if isinstance(value, int):
+        return FieldControl(name, "count", value, 1, 3 * max(value, 1))
+    if isinstance(value, float):
+        if name in _PIXELS:
+            return FieldControl(name, "number", value, value / 2, 4 * value)
+        return FieldControl(name, "number", value, min(0.0, 2 * value), max(1.0, 2 * value))
+    if isinstance(value, tuple) and len(value) == 2:
+        low, high = value
+        return FieldControl(name, "range", value, min(0.0, 2 * low), max(2 * high, 0.1))
+    return None
+
+
+def with_values(cfg: SubTerrainCfg, values: dict[str, Any]) -> SubTerrainCfg:
+    """Return a copy of the config with the values of controls."""
+    typed = {name: tuple(v) if isinstance(v, (list, tuple)) else v for name, v in values.items()}
+    return dataclasses.replace(cfg, **typed)
 
 
 def main() -> None:

@@ -21,6 +21,9 @@ from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS, host_model
 from mjlab.viewer.page_server import check_address, page_url, serve_page
 from mjlab.viewer.viser.scene import MjlabViserScene
 
+_FIELDS = ("qpos", "qvel", "act", "ctrl", "xfrc_applied", "qacc")
+_SHOWN_ENVS = 10
+
 
 @dataclass(frozen=True)
 class VizNanConfig:
@@ -30,6 +33,12 @@ class VizNanConfig:
     """Address to serve on; `0.0.0.0` serves the whole network."""
     port: int = 8080
     """Port to serve on; the next free one where it is taken."""
+
+
+def command(argv: list[str], prog: str) -> None:
+    """Run `viz-nan`."""
+    dump, *flags = argv
+    run_viz_nan(dump, parse_flags(VizNanConfig, VizNanConfig(), flags, f"{prog} DUMP"))
 
 
 def run_viz_nan(path: str, cfg: VizNanConfig) -> None:
@@ -100,10 +109,6 @@ def load_dump(path: str) -> tuple[NanDump, mujoco.MjModel]:
             f"{error}."
         ) from error
     return dump, model
-
-
-_FIELDS = ("qpos", "qvel", "act", "ctrl", "xfrc_applied", "qacc")
-_SHOWN_ENVS = 10
 
 
 class NanPage:
@@ -219,12 +224,6 @@ def _largest(model: mujoco.MjModel, values: Any) -> str:
     joint = int(model.dof_jntid[dof])
     name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"joint {joint}"
     return f"{abs(values[dof]):.3g} ({name})"
-
-
-def command(argv: list[str], prog: str) -> None:
-    """Run `viz-nan`."""
-    dump, *flags = argv
-    run_viz_nan(dump, parse_flags(VizNanConfig, VizNanConfig(), flags, f"{prog} DUMP"))
 
 
 def main() -> None:
