@@ -12,11 +12,11 @@ import torch
 from commands import TASK
 
 from mjlab.scripts import launcher
-from mjlab.scripts.cli import UserError
+from mjlab.scripts.devices import gpus_to_share, training_device
 from mjlab.scripts.launcher import launch_workers
 from mjlab.scripts.process_output import log_file, output_of
-from mjlab.scripts.train_run import TrainConfig
-from mjlab.scripts.training_device import gpus_to_share, training_device
+from mjlab.scripts.train import TrainConfig
+from mjlab.utils.errors import UserError
 from mjlab.utils.processes import ProcessRank
 
 PROGRAM = "import os, pathlib, signal, sys, time\nrank = os.environ['RANK']\n"

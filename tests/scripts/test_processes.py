@@ -15,7 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from mjlab.rl.checkpoint import load_checkpoint
 from mjlab.scripts.run_folder import checkpoints_in, read_run_info
-from mjlab.scripts.train_run import _build_env, parse_train_flags
+from mjlab.scripts.train import _build_env, parse_train_flags
 from mjlab.utils.processes import ProcessRank, available_cores
 from mjlab.utils.random import process_seed
 

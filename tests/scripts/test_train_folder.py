@@ -118,7 +118,7 @@ def test_a_folder_that_takes_no_more_is_told_without_tracebacks(tmp_path):
     program = (
         "import resource, signal, time\n"
         "now = time.time\n"
-        "from mjlab.scripts import train_run\n"
+        "from mjlab.scripts import display\n"
         "def limit(self, stats):\n"
         "    if stats.iteration < 3:\n        return\n"
         "    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
@@ -126,7 +126,7 @@ def test_a_folder_that_takes_no_more_is_told_without_tracebacks(tmp_path):
         # Event files are written every ten seconds.
         "    time.time = lambda: now() + 1000.0 * stats.iteration\n"
         "    time.sleep(0.02)\n"
-        "train_run._Beginning.on_iteration = limit\n"
+        "display.KeepRunFolder.on_iteration = limit\n"
         "from mjlab.scripts.train import main\n"
         "main()\n"
     )

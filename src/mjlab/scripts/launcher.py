@@ -10,7 +10,8 @@ import time
 from collections.abc import Mapping
 from types import FrameType
 
-from mjlab.scripts.cli import OTHER_PROCESS_STATUS, UserError
+from mjlab.scripts.cli import OTHER_PROCESS_STATUS
+from mjlab.utils.errors import UserError
 from mjlab.utils.processes import PARENT_VARIABLE, cores_per_process
 
 # What ends the launcher, and what the processes get for it: they save at the first two.
