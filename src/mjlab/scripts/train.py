@@ -10,7 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mjlab.compat import older_names
-from mjlab.rl.distributed import from_first, joined_processes, same_fate
+from mjlab.rl.distributed import (
+    ProcessOutput,
+    broadcast_from_first,
+    fail_together,
+    joined_processes,
+    launch_workers,
+    log_file,
+    output_of,
+)
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.devices import gpus_to_share, training_device
 from mjlab.scripts.display import KeepRunFolder, TrainingDisplay, leave_results, report_divergence
@@ -23,7 +31,6 @@ from mjlab.scripts.flags import (
     with_task_options,
 )
 from mjlab.scripts.policy import prepare_teacher
-from mjlab.scripts.process_output import ProcessOutput, log_file, output_of
 from mjlab.scripts.resume import (
     check_learner_resumes,
     checkpoint_to_resume,
@@ -59,11 +66,9 @@ def command(argv: list[str], prog: str) -> None:
     if not gpus:
         launch_training(task, cfg)
         return
-    from mjlab.scripts.launcher import launch_workers, train_command
-
     check_flags(cfg)
     # Of the GPUs that they see, the processes use all.
-    workers = train_command(task, [*flags, "--gpu-ids", "all"])
+    workers = [sys.executable, "-m", "mjlab.scripts.train", task, *flags, "--gpu-ids", "all"]
     launch_workers(workers, len(gpus), {"CUDA_VISIBLE_DEVICES": ",".join(map(str, gpus))})
 
 
@@ -99,7 +104,7 @@ def launch_training(task: str, cfg: TrainConfig) -> Path:
         device = training_device(cfg, rank)
     with joined_processes(device), output_of(rank) as output:
         prepare_torch(device)
-        with same_fate():
+        with fail_together():
             check_flags(cfg)
         return _train(task, cfg, device, rank, output)
 
@@ -111,9 +116,9 @@ def _train(
     task: str, cfg: TrainConfig, device: str, rank: ProcessRank, output: ProcessOutput | None
 ) -> Path:
     # The checkpoint is looked for before there is a new folder to be found, and by one process.
-    checkpoint = from_first(lambda: checkpoint_to_resume(task, cfg))
+    checkpoint = broadcast_from_first(lambda: checkpoint_to_resume(task, cfg))
     if cfg.agent.seed == -1:
-        cfg.agent.seed = from_first(lambda: choose_seed(checkpoint))
+        cfg.agent.seed = broadcast_from_first(lambda: choose_seed(checkpoint))
     cfg.apply_short_forms(rank)
     if checkpoint is not None:
         check_learner_resumes(cfg, checkpoint)
@@ -122,10 +127,10 @@ def _train(
         suggest_profile(task, cfg.profile, device)
         if rank.is_first:
             tell_foreign_learner(task, cfg.profile, cfg.learner_name)
-    with same_fate():
+    with fail_together():
         prepare_teacher(task, cfg.agent, checkpoint)
     with _run_folder(cfg, rank, output) as folder:
-        with same_fate():
+        with fail_together():
             fetched_from = None if checkpoint is None else cfg.wandb_run_path
             prepare_env_cfg(task, cfg, cfg.env, checkpoint, fetched_from)
             env = training_env(cfg, device, folder.path, rank)
@@ -135,7 +140,7 @@ def _train(
             each = "" if rank.is_alone else f" in each of {rank.world_size} processes"
             print(f"Task:    {task}, {env.num_envs} environments{each}{under}")
             print(f"Physics: {env.unwrapped.sim.capabilities.description}", flush=True)
-            with same_fate():
+            with fail_together():
                 runner = training_runner(task, cfg, env, folder.path, device)
                 if checkpoint is not None:
                     runner.load(str(checkpoint))
@@ -169,7 +174,7 @@ def _run_folder(
     with contextlib.ExitStack() as stack:
         new = NewRunFolder(experiment, cfg.agent.run_name)
         stack.enter_context(exit_by_signal(unless=lambda: new.is_kept))
-        path = from_first(lambda: stack.enter_context(new).path)
+        path = broadcast_from_first(lambda: stack.enter_context(new).path)
         if output is not None:
             output.keep_in(log_file(rank, cfg.torchrunx_log_dir, path))
         yield new if rank.is_first else SharedRunFolder(path)
