@@ -455,7 +455,7 @@ def run_sim(
         line_range: First and last line to read, counted from 1. None reads all.
         renderer: Without effect.
     """
-    from mjlab.scripts.csv_to_npz_run import record_motion
+    from mjlab.scripts.csv_to_npz import record_motion
     from mjlab.tasks.tracking.motion_file import npz_path, write_motion
     from mjlab.tasks.tracking.motion_recording import make_motion, read_csv, resampled
 
