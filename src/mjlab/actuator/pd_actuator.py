@@ -14,7 +14,7 @@ from mjlab.utils.indexing import EnvIds, as_rows
 from mjlab.utils.spec import create_motor_actuator
 
 if TYPE_CHECKING:
-    from mjlab.entity import Entity
+    from mjlab.entity.entity import Entity
 
 
 @dataclass(kw_only=True)
@@ -38,15 +38,6 @@ class IdealPdActuatorCfg(ActuatorCfg):
 
 
 IdealPdCfgT = TypeVar("IdealPdCfgT", bound=IdealPdActuatorCfg)
-
-
-def pd_torque(stiffness: torch.Tensor, damping: torch.Tensor, cmd: ActuatorCmd) -> torch.Tensor:
-    """Return kp (p* - l) + kd (v* - l') + f*, (N, n)."""
-    return (
-        stiffness * (cmd.position_target - cmd.pos)
-        + damping * (cmd.velocity_target - cmd.vel)
-        + cmd.effort_target
-    )
 
 
 class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
@@ -124,12 +115,9 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
             ("damping", self.cfg.damping),
             ("force_limit", self.cfg.effort_limit),
         ):
-            setattr(self, name, torch.full(shape, float(value), dtype=torch.float32, device=device))
-            setattr(
-                self,
-                f"default_{name}",
-                torch.full(shape, float(value), dtype=torch.float32, device=device),
-            )
+            for attribute in (name, f"default_{name}"):
+                full = torch.full(shape, float(value), dtype=torch.float32, device=device)
+                setattr(self, attribute, full)
 
     def compute(self, cmd: ActuatorCmd) -> torch.Tensor:
         """Return the forces, (N, n), by the class's control law."""
@@ -159,7 +147,7 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
         """
         for parameter, value, what in ((self.stiffness, kp, "kp"), (self.damping, kd, "kd")):
             if value is not None:
-                rows = as_rows(env_ids, *_rows_of(parameter))
+                rows = as_rows(env_ids, len(parameter), parameter.device)
                 parameter[rows] = _per_target(value, (len(rows), parameter.shape[1]), what)
 
     def set_effort_limit(self, env_ids: EnvIds, effort_limit: torch.Tensor) -> None:
@@ -171,7 +159,7 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
         Raises:
             ValueError: a tensor of another shape.
         """
-        rows = as_rows(env_ids, *_rows_of(self.force_limit))
+        rows = as_rows(env_ids, len(self.force_limit), self.force_limit.device)
         shape = (len(rows), self.force_limit.shape[1])
         limit = _per_target(effort_limit, shape, "effort_limit")
         self.force_limit[rows] = limit
@@ -186,8 +174,13 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
                 values[rows[:, None], columns] = ranges
 
 
-def _rows_of(parameter: torch.Tensor) -> tuple[int, torch.device]:
-    return parameter.shape[0], parameter.device
+def pd_torque(stiffness: torch.Tensor, damping: torch.Tensor, cmd: ActuatorCmd) -> torch.Tensor:
+    """Return kp (p* - l) + kd (v* - l') + f*, (N, n)."""
+    return (
+        stiffness * (cmd.position_target - cmd.pos)
+        + damping * (cmd.velocity_target - cmd.vel)
+        + cmd.effort_target
+    )
 
 
 def _per_target(value: torch.Tensor, shape: tuple[int, int], what: str) -> torch.Tensor:

@@ -6,7 +6,8 @@ import functools
 import logging
 import warnings
 from collections.abc import Callable, Collection
-from typing import TYPE_CHECKING, Any
+from enum import Enum
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,14 +19,19 @@ from mjlab.utils.xml import (  # noqa: F401
     put_files_in_memory,
 )
 
-if TYPE_CHECKING:
-    from mjlab.actuator.actuator import TransmissionType
+
+class TransmissionType(str, Enum):  # noqa: UP042 (part of the interface)
+    """What an actuator acts on."""
+
+    JOINT = "joint"
+    TENDON = "tendon"
+    SITE = "site"
 
 
 # MERGED mjlab.utils.spec: Adding actuators to a spec, with the passive properties of the joint or tendon they drive.
 
 
-# Transmission types are compared by value: their enum belongs to a layer above.
+# Transmission types are compared by value: a string may be given too.
 _TRANSMISSIONS = {
     "joint": mujoco.mjtTrn.mjTRN_JOINT,
     "tendon": mujoco.mjtTrn.mjTRN_TENDON,
