@@ -28,10 +28,11 @@ from mjlab.entity.building import (
     take_keys,
     take_options,
 )
-from mjlab.entity.data import EntityData, EnvIds, as_values, assign
+from mjlab.entity.data import EntityData, as_values, assign
 from mjlab.entity.indexing import EntityIndexing as EntityIndexing
 from mjlab.entity.indexing import Ids, build_indexing
 from mjlab.utils import spec_config as spec_cfg
+from mjlab.utils.indexing import EnvIds
 from mjlab.utils.lab_api.string import resolve_matching_names
 from mjlab.utils.spec import auto_wrap_fixed_base_mocap, compile_composed
 from mjlab.utils.state import stateful
