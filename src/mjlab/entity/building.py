@@ -63,6 +63,19 @@ _AUTHORED_ORDER = (
 )
 
 
+def copy_spec(made: Any, function: str) -> mujoco.MjSpec:
+    """Return a copy of what a user's function made; raise `ValueError` if it is not a spec.
+
+    Editors change it, a scene takes it in, and a function might return one spec twice.
+    """
+    if not isinstance(made, mujoco.MjSpec):
+        raise ValueError(
+            f"{function} returned {type(made).__name__}; it must return a mujoco.MjSpec, such as "
+            "mujoco.MjSpec.from_file(path)."
+        )
+    return made.copy()
+
+
 # Simulation options. A scene has one `<option>`. Attaching a spec to the scene drops the `<option>`
 # of that spec, so what an entity asks for is taken out before, and the scene decides what becomes of
 # it.

@@ -17,6 +17,7 @@ from mjlab.actuator.fused_group import FusedActuatorGroup
 from mjlab.entity.building import (
     add_key,
     build_actuators,
+    copy_spec,
     find_joints,
     place_body,
     pop_keyframes,
@@ -171,14 +172,7 @@ class Entity:
         add_key(self._spec, [self.initial_state])
 
     def _make_spec(self) -> mujoco.MjSpec:
-        spec = self.cfg.spec_fn()
-        if not isinstance(spec, mujoco.MjSpec):
-            raise ValueError(
-                f"EntityCfg.spec_fn returned {type(spec).__name__}; it must return a "
-                "mujoco.MjSpec, such as mujoco.MjSpec.from_file(path)."
-            )
-        # Editors change it, a scene takes it in, and a function might return one spec twice.
-        return spec.copy()
+        return copy_spec(self.cfg.spec_fn(), "EntityCfg.spec_fn")
 
     def _placeable(self, spec: mujoco.MjSpec) -> mujoco.MjSpec:
         """Return `spec` under a mocap body, if its base is fixed."""
