@@ -191,6 +191,26 @@ def short_names(elements: Iterable[Any]) -> tuple[str, ...]:
     return tuple(short_name(element.name) for element in elements)
 
 
+Found = tuple[list[int], list[str]]
+"""Ids within an entity, and names."""
+
+
+def find_names(
+    kind: str,
+    name_keys: str | Sequence[str],
+    names: Sequence[str],
+    subset: Sequence[str] | None = None,
+    preserve_order: bool = False,
+) -> Found:
+    """Find names by regular expressions; errors name the `kind` of elements. See `Entity`."""
+    try:
+        return resolve_matching_names(
+            name_keys, names if subset is None else subset, preserve_order
+        )
+    except ValueError as error:
+        raise ValueError(f"Cannot find {kind} by {name_keys!r}. {error}") from None
+
+
 # Actuators.
 
 

@@ -15,10 +15,12 @@ from mjlab.actuator.actuator import Actuator, ActuatorCfg, TransmissionType
 from mjlab.actuator.builtin_group import BuiltinActuatorGroup
 from mjlab.actuator.fused_group import FusedActuatorGroup
 from mjlab.entity.building import (
+    Found,
     add_key,
     build_actuators,
     copy_spec,
     find_joints,
+    find_names,
     place_body,
     pop_keyframes,
     pop_options,
@@ -32,12 +34,9 @@ from mjlab.sim.randomization import VariantInfo
 from mjlab.utils import spec_config as spec_cfg
 from mjlab.utils.errors import WrongStateError
 from mjlab.utils.indexing import EnvIds, as_index
-from mjlab.utils.lab_api.string import resolve_matching_names
 from mjlab.utils.spec import auto_wrap_fixed_base_mocap, compile_composed
 from mjlab.utils.state import stateful
 from mjlab.utils.xml import fix_spec_xml, strip_buffer_textures
-
-Found = tuple[list[int], list[str]]
 
 
 @dataclass
@@ -438,7 +437,7 @@ class Entity:
 
     def find_bodies(self, name_keys: str | Sequence[str], preserve_order: bool = False) -> Found:
         """Find bodies by name."""
-        return _find("bodies", name_keys, self.body_names, None, preserve_order)
+        return find_names("bodies", name_keys, self.body_names, preserve_order=preserve_order)
 
     def find_joints(
         self,
@@ -447,7 +446,7 @@ class Entity:
         preserve_order: bool = False,
     ) -> Found:
         """Find joints by name; the free joint is none of them."""
-        return _find("joints", name_keys, self.joint_names, joint_subset, preserve_order)
+        return find_names("joints", name_keys, self.joint_names, joint_subset, preserve_order)
 
     def find_geoms(
         self,
@@ -456,7 +455,7 @@ class Entity:
         preserve_order: bool = False,
     ) -> Found:
         """Find geoms by name."""
-        return _find("geoms", name_keys, self.geom_names, geom_subset, preserve_order)
+        return find_names("geoms", name_keys, self.geom_names, geom_subset, preserve_order)
 
     def find_sites(
         self,
@@ -465,7 +464,7 @@ class Entity:
         preserve_order: bool = False,
     ) -> Found:
         """Find sites by name."""
-        return _find("sites", name_keys, self.site_names, site_subset, preserve_order)
+        return find_names("sites", name_keys, self.site_names, site_subset, preserve_order)
 
     def find_tendons(
         self,
@@ -474,7 +473,7 @@ class Entity:
         preserve_order: bool = False,
     ) -> Found:
         """Find tendons by name."""
-        return _find("tendons", name_keys, self.tendon_names, tendon_subset, preserve_order)
+        return find_names("tendons", name_keys, self.tendon_names, tendon_subset, preserve_order)
 
     def find_actuators(
         self,
@@ -483,7 +482,9 @@ class Entity:
         preserve_order: bool = False,
     ) -> Found:
         """Find actuators by name."""
-        return _find("actuators", name_keys, self.actuator_names, actuator_subset, preserve_order)
+        return find_names(
+            "actuators", name_keys, self.actuator_names, actuator_subset, preserve_order
+        )
 
     def find_cameras(
         self,
@@ -492,7 +493,7 @@ class Entity:
         preserve_order: bool = False,
     ) -> Found:
         """Find cameras by name."""
-        return _find("cameras", name_keys, self.camera_names, camera_subset, preserve_order)
+        return find_names("cameras", name_keys, self.camera_names, camera_subset, preserve_order)
 
     def find_lights(
         self,
@@ -501,7 +502,7 @@ class Entity:
         preserve_order: bool = False,
     ) -> Found:
         """Find lights by name."""
-        return _find("lights", name_keys, self.light_names, light_subset, preserve_order)
+        return find_names("lights", name_keys, self.light_names, light_subset, preserve_order)
 
     def find_materials(
         self,
@@ -510,7 +511,9 @@ class Entity:
         preserve_order: bool = False,
     ) -> Found:
         """Find materials by name."""
-        return _find("materials", name_keys, self.material_names, material_subset, preserve_order)
+        return find_names(
+            "materials", name_keys, self.material_names, material_subset, preserve_order
+        )
 
     def find_textures(
         self,
@@ -519,7 +522,7 @@ class Entity:
         preserve_order: bool = False,
     ) -> Found:
         """Find textures by name."""
-        return _find("textures", name_keys, self.texture_names, texture_subset, preserve_order)
+        return find_names("textures", name_keys, self.texture_names, texture_subset, preserve_order)
 
     def find_pairs(
         self,
@@ -528,7 +531,7 @@ class Entity:
         preserve_order: bool = False,
     ) -> Found:
         """Find contact pairs by name."""
-        return _find("pairs", name_keys, self.pair_names, pair_subset, preserve_order)
+        return find_names("pairs", name_keys, self.pair_names, pair_subset, preserve_order)
 
     def find_joints_by_actuator_names(self, actuator_name_keys: Any) -> Found:
         """Find joints, in the entity's order, among those that a configured actuator acts on.
@@ -544,7 +547,7 @@ class Entity:
         }
         names = self.joint_names
         candidates = [name for name in names if name in actuated]
-        _, found = _find("actuated joints", actuator_name_keys, candidates, None, False)
+        _, found = find_names("actuated joints", actuator_name_keys, candidates)
         return [names.index(name) for name in found], found
 
     # Targets of actuators.
@@ -701,12 +704,31 @@ class Entity:
             self._spec_to_write.to_zip(file)
 
 
+def _set_target(
+    target: torch.Tensor, value: torch.Tensor, ids: Ids, env_ids: EnvIds, kind: str
+) -> None:
+    width = target.shape[1]
+    if width == 0:
+        raise ValueError(
+            f"This entity has no {kind} targets: it has no {kind}s"
+            + ("." if kind == "joint" else f", or no configured actuator acts on a {kind}.")
+        )
+    columns: slice | torch.Tensor
+    if ids is None:
+        columns = slice(None)
+    elif isinstance(ids, slice):
+        columns, width = ids, len(range(*ids.indices(width)))
+    else:
+        columns = torch.as_tensor(ids, device=target.device)
+        if columns.dtype == torch.bool:
+            columns = columns.nonzero().flatten()
+        width = columns.shape[0]
+    values = as_values(value, width, f"The {kind} target", str(target.device), broadcasts=True)
+    assign(target, values, env_ids, columns)
+
+
 def _make_data(
-    entity: Entity,
-    indexing: EntityIndexing,
-    model: Any,
-    data: Any,
-    device: str,
+    entity: Entity, indexing: EntityIndexing, model: Any, data: Any, device: str
 ) -> EntityData:
     """Return the data of `entity`, with defaults from its config and all targets zero."""
     num_envs = data.nworld
@@ -722,7 +744,11 @@ def _make_data(
 
     articulation = entity.cfg.articulation
     factor = 1.0 if articulation is None else articulation.soft_joint_pos_limit_factor
-    limits = _joint_limits(model, indexing)
+    ids = indexing.joint_ids.long()
+    # Read from the simulation, because variants of an entity may have limits of their own.
+    limits, limited = model.jnt_range[:, ids].clone().float(), model.jnt_limited[..., ids].bool()
+    limits[..., 0].masked_fill_(~limited, -torch.inf)
+    limits[..., 1].masked_fill_(~limited, torch.inf)
     num_tendons = len(indexing.tendons) if entity.has_tendon_actuators else 0
     return EntityData(
         indexing=indexing,
@@ -751,58 +777,9 @@ def _make_data(
     )
 
 
-def _joint_limits(model: Any, indexing: EntityIndexing) -> torch.Tensor:
-    """Return (N, nj, 2) limits, infinite where the compiled joint is not limited."""
-    ids = indexing.joint_ids.long()
-    # Read from the simulation, because variants of an entity may have limits of their own.
-    limits = model.jnt_range[:, ids].clone().float()
-    limited = model.jnt_limited[..., ids].bool()
-    limits[..., 0].masked_fill_(~limited, -torch.inf)
-    limits[..., 1].masked_fill_(~limited, torch.inf)
-    return limits
-
-
 def _shrunk(limits: torch.Tensor, factor: float) -> torch.Tensor:
     """Return limits scaled by `factor` about their middle; infinite ones stay so."""
     middle = limits.mean(dim=-1)
     half = 0.5 * factor * (limits[..., 1] - limits[..., 0])
     shrunk = torch.stack((middle - half, middle + half), dim=-1)
     return torch.where(torch.isinf(limits), limits, shrunk)
-
-
-def _find(
-    kind: str,
-    name_keys: str | Sequence[str],
-    names: Sequence[str],
-    subset: Sequence[str] | None,
-    preserve_order: bool,
-) -> Found:
-    try:
-        return resolve_matching_names(
-            name_keys, names if subset is None else subset, preserve_order
-        )
-    except ValueError as error:
-        raise ValueError(f"Cannot find {kind} by {name_keys!r}. {error}") from None
-
-
-def _set_target(
-    target: torch.Tensor, value: torch.Tensor, ids: Ids, env_ids: EnvIds, what: str
-) -> None:
-    width = target.shape[1]
-    if width == 0:
-        raise ValueError(
-            f"This entity has no {what} targets: it has no {what}s"
-            + ("." if what == "joint" else f", or no configured actuator acts on a {what}.")
-        )
-    columns: slice | torch.Tensor
-    if ids is None:
-        columns = slice(None)
-    elif isinstance(ids, slice):
-        columns, width = ids, len(range(*ids.indices(width)))
-    else:
-        columns = torch.as_tensor(ids, device=target.device)
-        if columns.dtype == torch.bool:
-            columns = columns.nonzero().flatten()
-        width = columns.shape[0]
-    values = as_values(value, width, f"The {what} target", str(target.device), broadcasts=True)
-    assign(target, values, env_ids, columns)
