@@ -12,7 +12,7 @@ import torch
 from mjlab.compat import offers_older_attributes, older_names
 from mjlab.entity.indexing import Addresses, EntityIndexing, Ids
 from mjlab.utils.errors import UnsupportedError
-from mjlab.utils.indexing import EnvIds, as_index, as_rows
+from mjlab.utils.indexing import EnvIds, as_ids, as_index
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse, quat_from_matrix, quat_mul
 from mjlab.utils.state import stateful
 
@@ -759,7 +759,7 @@ def assign(
     if env_ids is None:
         field[:, columns] = value
     elif isinstance(columns, torch.Tensor) and not isinstance(env_ids, slice):
-        field[as_rows(env_ids, len(field), field.device)[:, None], columns] = value
+        field[as_ids(env_ids, len(field), field.device)[:, None], columns] = value
     else:
         field[env_ids, columns] = value
 

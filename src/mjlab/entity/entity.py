@@ -33,7 +33,7 @@ from mjlab.entity.indexing import Ids, build_indexing
 from mjlab.sim.randomization import VariantInfo
 from mjlab.utils import spec_config as spec_cfg
 from mjlab.utils.errors import WrongStateError
-from mjlab.utils.indexing import EnvIds, as_index
+from mjlab.utils.indexing import EnvIds, as_ids, as_index
 from mjlab.utils.spec import auto_wrap_fixed_base_mocap, compile_composed
 from mjlab.utils.state import stateful
 from mjlab.utils.xml import fix_spec_xml, strip_buffer_textures
@@ -719,9 +719,7 @@ def _set_target(
     elif isinstance(ids, slice):
         columns, width = ids, len(range(*ids.indices(width)))
     else:
-        columns = torch.as_tensor(ids, device=target.device)
-        if columns.dtype == torch.bool:
-            columns = columns.nonzero().flatten()
+        columns = as_ids(ids, width, target.device)
         width = columns.shape[0]
     values = as_values(value, width, f"The {kind} target", str(target.device), broadcasts=True)
     assign(target, values, env_ids, columns)

@@ -10,6 +10,8 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
+from mjlab.utils.errors import check_one_of
+
 CommandField = Literal["position", "velocity", "effort"]
 
 _FREE, _BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
@@ -41,10 +43,7 @@ def enum_value(option: str, name: Any, enum: Any, prefix: str = "") -> int:
         ValueError: an unknown name, with the valid ones. `option` says where it was given.
     """
     members = _members(enum, prefix)
-    if name not in members:
-        raise ValueError(
-            f"{option}: {name!r} is not known to MuJoCo. Choose from: {', '.join(members)}."
-        )
+    check_one_of(option, name, members)
     return members[name]
 
 
