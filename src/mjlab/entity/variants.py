@@ -44,6 +44,7 @@ from mjlab.sim.randomization import (
     put_variant_model,
 )
 from mjlab.sim.randomization import VARIANT_DEPENDENT_FIELDS as VARIANT_DEPENDENT_FIELDS
+from mjlab.utils.errors import check_exists
 from mjlab.utils.mujoco import control_columns, dof_width, force_columns, qpos_width
 from mjlab.utils.spec import compile_composed, compile_spec
 
@@ -285,12 +286,8 @@ def resolve_assignment(
     if assignment is not None and not isinstance(assignment, dict):
         return assignment
     weights_by_name: dict[str, float] = {} if assignment is None else assignment
-    unknown = [name for name in weights_by_name if name not in names]
-    if unknown:
-        raise ValueError(
-            f"VariantEntityCfg.assignment names the variants {unknown}, which do not exist. "
-            f"There are: {list(names)}."
-        )
+    for name in weights_by_name:
+        check_exists("variant in VariantEntityCfg.assignment", name, names)
     weights = tuple(float(weights_by_name.get(name, 1.0)) for name in names)
     try:
         allocate_worlds(weights, 1)
