@@ -318,7 +318,7 @@ class Scene:
 
     def _attach(self, name: str, entity: Entity, prefix: str) -> None:
         self._entities[name] = entity
-        entity.keep_spec_to_write()
+        entity.snapshot_spec()
         # MuJoCo would carry the entity's keyframe over, padded with the other entities' qpos0. The
         # scene's own holds the initial state of all.
         for key in list(entity.spec.keys):
