@@ -2,6 +2,7 @@
 
     MjlabError                 base; commands print the message without a traceback
     ├── UserError              in what a command was asked to do
+    │   └── BadCallError       in the command line itself; nothing was started
     ├── UnknownNameError       no such entity, sensor, term, ...   (a KeyError)
     ├── UnknownAttributeError  no such attribute                   (an AttributeError)
     ├── WrongTypeError         value or class of the wrong type    (a TypeError)
@@ -25,12 +26,18 @@ from mjlab.utils.string import suggest
 class MjlabError(Exception):
     """Base of errors that a user can fix."""
 
+    exit_status = 1
+    """Exit status of a command that ends with this error."""
+
 
 class UserError(MjlabError):
     """Error in what a command was asked to do."""
 
-    exit_status = 1
-    """Exit status of the command."""
+
+class BadCallError(UserError):
+    """Error in the command line itself, found before anything is built."""
+
+    exit_status = 2
 
 
 class UnknownNameError(MjlabError, KeyError):
