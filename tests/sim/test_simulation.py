@@ -439,12 +439,12 @@ def test_options_are_written_and_unknown_ones_listed():
     assert model.opt.gravity[2] == -1
     assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
-    with pytest.raises(ValueError, match=r"disableflags: 'contacts'.*contact"):
+    with pytest.raises(ValueError, match=r"disableflags.*'contact'.*'contacts'"):
         MujocoCfg(disableflags=("contacts",)).apply(model)
-    with pytest.raises(ValueError, match=r"solver: 'magic'.*newton"):
+    with pytest.raises(ValueError, match=r"solver.*'newton'.*'magic'"):
         MujocoCfg(solver="magic").apply(model)  # ty: ignore
     for wrong in (mujoco.mjtCone.mjCONE_ELLIPTIC, 1, None, ("pyramidal", "elliptic")):
-        with pytest.raises(ValueError, match=r"MujocoCfg.cone: .*pyramidal, elliptic"):
+        with pytest.raises(ValueError, match=r"MujocoCfg.cone.*'pyramidal', 'elliptic'"):
             MujocoCfg(cone=wrong).apply(model)  # ty: ignore
 
 

@@ -286,7 +286,7 @@ def test_capacities_are_estimated_if_not_given() -> None:
 
 
 def test_an_unknown_broadphase_lists_the_known_ones() -> None:
-    with pytest.raises(ValueError, match="nxn, sap_tile, sap_segmented"):
+    with pytest.raises(ValueError, match="'nxn', 'sap_tile', 'sap_segmented'"):
         make_engine(TWO_JOINTS, broadphase="octree")
 
 

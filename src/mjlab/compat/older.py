@@ -314,10 +314,10 @@ class ContactSlot:
     @property
     def data_view(self) -> torch.Tensor:
         """Present values, (N, number of slots times size of the field)."""
-        layout = self.sensor._layout
-        values = layout.split(self.sensor._block())[self.field_name]
-        first = self.index * layout.num_slots
-        return values[:, first : first + layout.num_slots].flatten(1)
+        values = self.sensor._split(self.sensor._block())[self.field_name]
+        num_slots = self.sensor.cfg.num_slots
+        first = self.index * num_slots
+        return values[:, first : first + num_slots].flatten(1)
 
 
 def contact_slots(sensor: ContactSensor) -> list[ContactSlot]:
@@ -455,7 +455,7 @@ def run_sim(
         line_range: First and last line to read, counted from 1. None reads all.
         renderer: Without effect.
     """
-    from mjlab.scripts.csv_to_npz_run import record_motion
+    from mjlab.scripts.csv_to_npz import record_motion
     from mjlab.tasks.tracking.motion_file import npz_path, write_motion
     from mjlab.tasks.tracking.motion_recording import make_motion, read_csv, resampled
 

@@ -11,11 +11,11 @@ import pytest
 import yaml
 from commands import TASK
 
-from mjlab.scripts.evaluate_run import EvaluateConfig
+from mjlab.scripts.evaluate import EvaluateConfig
+from mjlab.scripts.flags import suggest_profile
 from mjlab.scripts.policy import env_cfg_of, parse_policy_flags, policy_env_cfg
-from mjlab.scripts.profiles import suggest_profile
 from mjlab.scripts.run_folder import read_run_info, write_run_info
-from mjlab.scripts.train_run import TrainConfig, parse_train_flags
+from mjlab.scripts.train import TrainConfig, parse_train_flags
 from mjlab.tasks import registry
 from mjlab.tasks.cpu_profile import cpu_profile
 
@@ -225,7 +225,7 @@ def test_list_envs_shows_profiles_and_imports_no_torch(run):
     (line,) = (line for line in lines if PLAIN in line)
     assert line.endswith(PLAIN)
     code = (
-        "import sys\nfrom mjlab.scripts.list_envs import _command\n_command([])\n"
+        "import sys\nfrom mjlab.scripts.list_envs import command\ncommand([], 'list-envs')\n"
         "assert not {'torch', 'mujoco'} & set(sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -6,11 +6,11 @@ from dataclasses import dataclass, fields
 
 import pytest
 
-from mjlab.scripts.evaluate_run import EvaluateConfig
-from mjlab.scripts.play_run import PlayConfig
+from mjlab.scripts.evaluate import EvaluateConfig
+from mjlab.scripts.flags import options_of, prepare_env_cfg, with_task_options
+from mjlab.scripts.play import PlayConfig
 from mjlab.scripts.policy import env_cfg_of, parse_policy_flags
-from mjlab.scripts.task_options import options_of, prepare_env_cfg, with_task_options
-from mjlab.scripts.train_run import TrainConfig, parse_train_flags
+from mjlab.scripts.train import TrainConfig, parse_train_flags
 from mjlab.tasks import registry
 from mjlab.tasks.registry import PolicyOrigin, TaskOptions
 

@@ -122,13 +122,12 @@ def test_a_signal_while_building_leaves_no_folder(tmp_path, number):
     # Building takes as long as the signal needs; the folder is there by then.
     program = (
         "import os, signal, sys, time\n"
-        "from mjlab.scripts import train_run\n"
+        "from mjlab.scripts import train\n"
         "def build(*args):\n"
         f"    os.kill(os.getpid(), {int(number)})\n"
         "    time.sleep(30)\n"
-        "train_run._build_env = build\n"
-        "from mjlab.scripts.train import main\n"
-        "main()\n"
+        "train.training_env = build\n"
+        "train.main()\n"
     )
     flags = [TASK, *SMALL, "--log-root", str(tmp_path)]
     done = subprocess.run(

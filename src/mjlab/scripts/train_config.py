@@ -1,21 +1,26 @@
-"""What is wrong in the flags of `train` and can be told before anything is built."""
+"""Flags of `train`, and the checks of them that need nothing built."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
-from mjlab.scripts.cli import BadCallError, UserError, is_given
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.rl.config import RslRlBaseRunnerCfg
+from mjlab.rl.learners import Learner, learner_of
+from mjlab.scripts.flags import is_given
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
+from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.gpu import select_gpus
-from mjlab.utils.processes import process_rank
+from mjlab.utils.processes import ProcessRank, process_rank
+from mjlab.utils.random import process_seed
 from mjlab.viewer.page_server import check_address
 
-if TYPE_CHECKING:
-    from mjlab.scripts.train_run import TrainConfig
-
 _AGENT_COUNTS = ("num_steps_per_env", "max_iterations", "save_interval")
+
 _ALGORITHM_COUNTS = (
     "num_learning_epochs",
     "num_mini_batches",
@@ -27,7 +32,91 @@ _ALGORITHM_COUNTS = (
     "noise_hold",
     "gradient_length",
 )
+
 _SEPARATORS = ("/", "\\")
+
+
+@dataclass
+class TrainConfig:
+    """Flags of `train`."""
+
+    env: ManagerBasedRlEnvCfg
+    """The task."""
+    agent: RslRlBaseRunnerCfg
+    """The learner."""
+    profile: str | None = None
+    """Named settings of the task, such as `cpu`, that all other flags start from; `list-envs` shows
+    which there are. None: the task's own, or where a run is resumed, that run's."""
+    learner: Learner | None = None
+    """Learner, which decides what flags there are under --agent.: `ppo`; `sac`, which learns from a
+    replay (soft actor-critic); or `distillation`, a student of --agent.teacher-checkpoint. None: that of
+    the resumed run, else that of the profile or task."""
+    num_envs: int | None = None
+    """Number of environments, of each process; short for --env.scene.num-envs."""
+    device: str | None = None
+    """Torch device: cpu, cuda:0, ... None takes a GPU where there is one; several processes take
+    one each."""
+    engine: Literal["auto", "native", "warp"] | None = None
+    """Physics engine; short for --env.sim.engine."""
+    video: bool = False
+    """Record clips while training."""
+    video_length: int = 200
+    """Frames of a clip."""
+    video_interval: int = 2000
+    """Environment steps from the start of one clip to the next."""
+    result_video: bool = False
+    """Record a clip of the trained policy at the end."""
+    enable_nan_guard: bool = False
+    """Dump the states that lead to NaN."""
+    log_root: str = "logs/rsl_rl"
+    """Folder of all runs."""
+    torchrunx_log_dir: str | None = None
+    """Folder for what processes other than the first print; None is `torchrunx` in the run's
+    folder, and an empty name drops it. The variable TORCHRUNX_LOG_DIR wins."""
+    wandb_run_path: str | None = None
+    """With --agent.resume True: the Weights & Biases run to resume, as entity/project/run."""
+    wandb_checkpoint_name: str | None = None
+    """Checkpoint of that run; None takes the newest."""
+    live: bool = False
+    """Serve a page in the browser that shows the policy as it learns."""
+    live_port: int = 8080
+    """Port of that page; the next free one where it is taken."""
+    live_host: str = field(default="127.0.0.1", kw_only=True)
+    """Address that it is served on; 0.0.0.0 serves the whole network."""
+    gpu_ids: list[int] | Literal["all"] | None = field(default_factory=lambda: [0])
+    """Indices of the GPUs to use where --device is not given, or `all`; with several, a process
+    for each is started. None trains on the CPU."""
+
+    @staticmethod
+    def from_task(
+        task: str, profile: str | None = None, learner: Learner | None = None
+    ) -> TrainConfig:
+        """Return the configuration that a task was registered with, under one of its profiles.
+
+        `learner` takes the place of the one that the task or the profile chooses.
+        """
+        return TrainConfig(
+            env=load_env_cfg(task, profile=profile),
+            agent=load_rl_cfg(task, profile=profile, learner=learner),
+            profile=profile,
+            learner=learner,
+        )
+
+    @property
+    def learner_name(self) -> Learner:
+        """Learner that `agent` configures."""
+        return learner_of(self.agent)
+
+    def apply_short_forms(self, rank: ProcessRank) -> None:
+        """Write the short flags into `env`, and the seed of this process into `env` and `agent`."""
+        if self.num_envs is not None:
+            self.env.scene.num_envs = self.num_envs
+        if self.engine is not None:
+            self.env.sim.engine = self.engine
+        if self.enable_nan_guard:
+            self.env.sim.nan_guard.enabled = True
+        self.agent.seed = process_seed(self.agent.seed, rank.rank)
+        self.env.seed = self.agent.seed
 
 
 def check_flags(cfg: TrainConfig) -> None:

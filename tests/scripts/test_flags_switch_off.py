@@ -17,9 +17,8 @@ from mjlab.managers import (
     RecorderTermCfg,
     TerminationTermCfg,
 )
-from mjlab.scripts.cli import parse_flags
-from mjlab.scripts.switch_off import switch_terms_off
-from mjlab.scripts.train_run import TrainConfig
+from mjlab.scripts.flags import parse_flags, switch_terms_off
+from mjlab.scripts.train import TrainConfig
 from mjlab.utils.os import to_plain
 
 if TYPE_CHECKING:

@@ -40,5 +40,5 @@ def test_rays_start_at_elements_of_the_terrain(kind):
 
 
 def test_what_belongs_to_another_entity_is_not_the_terrains():
-    with pytest.raises(ValueError, match="Entity 'terrain' has no body 'ball'"):
+    with pytest.raises(ValueError, match="body 'ball' in entity 'terrain'"):
         _rays_from(ObjRef("body", "ball", entity="terrain"))

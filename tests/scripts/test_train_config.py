@@ -66,7 +66,7 @@ def test_too_little_memory_is_one_message(run, tmp_path, monkeypatch, error):
     def build(*args):
         raise error
 
-    monkeypatch.setattr("mjlab.scripts.train_run._build_env", build)
+    monkeypatch.setattr("mjlab.scripts.train.training_env", build)
     outcome = run("train", TASK, *SMALL, "--log-root", str(tmp_path))
     assert outcome.status == 1
     assert "Memory" in outcome.message
@@ -101,7 +101,7 @@ def test_a_message_of_a_damaged_file_is_cut_in_the_middle(run, monkeypatch):
     def build(*args, **kwargs):
         raise ValueError("begins " + "x" * 100_000 + " ends")
 
-    monkeypatch.setattr("mjlab.scripts.train_run.launch_training", build)
+    monkeypatch.setattr("mjlab.scripts.train.launch_training", build)
     outcome = run("train", TASK, *SMALL)
     assert outcome.status == 1
     assert len(outcome.err) < 10_000

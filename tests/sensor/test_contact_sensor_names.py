@@ -53,7 +53,7 @@ def test_entries_of_exclude_are_searched_if_they_look_like_patterns_and_exact_ot
 def test_without_an_entity_names_are_literal_and_in_the_order_given():
     scene = robot(geom(("robot/right_foot", "robot/left_foot"), None))
     assert scene["touch"].primary_names == ["robot/right_foot", "robot/left_foot"]
-    with pytest.raises(ValueError, match="taken literally"):
+    with pytest.raises(ValueError, match=r"'robot/.\*_foot'.*literal"):
         robot(geom("robot/.*_foot", None))
     with pytest.raises(ValueError, match="twice"):
         robot(geom(("robot/left_foot", "robot/left_foot"), None))
@@ -136,10 +136,10 @@ def test_a_secondary_subtree_is_named_in_its_entity():
 @pytest.mark.parametrize(
     ("match", "message"),
     [
-        (geom("left_fot", "robot"), r"'left_fot' matches none .* Close names: left_foot"),
-        (body("left_foot", "robot"), r"none of the bodies .* It has: \['trunk', 'left', 'right'\]"),
-        (geom("left_foot", "robt"), r"entity 'robt'. The scene has: \['robot', 'terrain'\]. Close"),
-        (geom("robot/left_fot", None), "'robot/left_fot', which .* Close names: robot/left_foot"),
+        (geom("left_fot", "robot"), "'left_fot' matches none .* 'left_foot'"),
+        (body("left_foot", "robot"), r"none of the bodies .*\['trunk', 'left', 'right'\]"),
+        (geom("left_foot", "robt"), "entity 'robt'.*mean 'robot'.*'terrain'"),
+        (geom("robot/left_fot", None), "'robot/left_fot' .* mean 'robot/left_foot'"),
         (geom(".*", "robot", exclude=(".*",)), "leaves nothing"),
         (geom("(", "robot"), "not a valid regular expression"),
     ],
@@ -161,15 +161,18 @@ def test_every_pattern_has_to_match_and_no_name_twice():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"fields": ("found", "forces")}, "fields has 'forces'; choose from: found, force, torque"),
-        ({"fields": ()}, "at least one field"),
-        ({"fields": ("found", "found")}, "none twice"),
-        ({"reduce": "sum"}, "reduce has 'sum'; choose from: none, mindist, maxforce, netforce"),
-        ({"secondary_policy": "last"}, "secondary_policy has 'last'"),
-        ({"num_slots": 0}, "num_slots=0"),
-        ({"history_length": -1}, "history_length=-1"),
-        ({"fields": ("force",), "track_air_time": True}, "needs 'found'"),
-        ({"global_frame": True, "fields": ("force", "normal")}, "needs tangent among the fields"),
+        ({"fields": ("found", "forces")}, "fields.*'found', 'force', 'torque'.*'forces'"),
+        ({"fields": ()}, r"fields.*\(\)"),
+        ({"fields": ("found", "found")}, r"fields.*distinct.*\('found', 'found'\)"),
+        ({"reduce": "sum"}, "reduce.*'none', 'mindist', 'maxforce', 'netforce'.*'sum'"),
+        ({"secondary_policy": "last"}, "secondary_policy.*'error'.*'last'"),
+        ({"num_slots": 0}, "num_slots.* 0"),
+        ({"history_length": -1}, "history_length.* -1"),
+        ({"fields": ("force",), "track_air_time": True}, "track_air_time=True.*'found'"),
+        (
+            {"global_frame": True, "fields": ("force", "normal")},
+            r"global_frame=True.*\['tangent'\]",
+        ),
         (
             {"global_frame": True, "reduce": "netforce", "fields": ("force", "normal", "tangent")},
             "cannot be combined with reduce='netforce'",
@@ -182,7 +185,7 @@ def test_a_config_that_makes_no_sense_is_refused(fields, message):
 
 
 def test_a_match_that_makes_no_sense_is_refused():
-    with pytest.raises(ValueError, match="choose from: geom, body, subtree"):
+    with pytest.raises(ValueError, match="mode.*'geom', 'body', 'subtree'.*'joint'"):
         ContactMatch(mode="joint", pattern="x")
 
 

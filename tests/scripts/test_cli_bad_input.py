@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import pickle
@@ -349,23 +350,23 @@ def test_a_log_folder_that_cannot_be_written_is_told_before_training(run, tmp_pa
 
 
 def test_a_full_disk_keeps_the_previous_checkpoint(run, tmp_path, monkeypatch):
-    write, write_text = checkpoint_module._write, Path.write_text
+    replacing, write_text = checkpoint_module.replacing, Path.write_text
 
     def refuse_if_full():
         if list(tmp_path.rglob("model_0.pt")):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def write_checkpoint(data, file):
-        file.write(b"half of i")
-        refuse_if_full()
-        file.seek(0)
-        write(data, file)
+    @contextlib.contextmanager
+    def write_checkpoint(path, **kwargs):
+        with replacing(path, **kwargs) as file:
+            yield file
+            refuse_if_full()
 
     def write_small_file(self, text):
         refuse_if_full()
         return write_text(self, text)
 
-    monkeypatch.setattr(checkpoint_module, "_write", write_checkpoint)
+    monkeypatch.setattr(checkpoint_module, "replacing", write_checkpoint)
     monkeypatch.setattr(Path, "write_text", write_small_file)
     outcome = run("train", TASK, *SMALL, "--log-root", str(tmp_path))
     assert outcome.status == 1

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from mjlab.scripts.policy import make_env
-from mjlab.scripts.train_run import TrainConfig, launch_training
+from mjlab.scripts.environments import make_env
+from mjlab.scripts.train import TrainConfig, launch_training
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 
 

@@ -1,18 +1,43 @@
-"""Which device each process of a training run gets."""
+"""Torch devices of commands: the one named, else a GPU if there is one; one GPU per process."""
 
 from __future__ import annotations
 
 import os
 from typing import TYPE_CHECKING
 
-from mjlab.scripts.cli import UserError, resolve_device
+from mjlab.utils.errors import UserError
 from mjlab.utils.gpu import egl_device_id, select_gpus
 from mjlab.utils.processes import ProcessRank, process_rank
 
 if TYPE_CHECKING:
-    from mjlab.scripts.train_run import TrainConfig
+    from mjlab.scripts.train_config import TrainConfig
 
 _EGL_VARIABLE = "MUJOCO_EGL_DEVICE_ID"
+
+
+def resolve_device(device: str | None) -> str:
+    """Return the torch device to use: the one asked for, else a GPU where there is one.
+
+    Raises:
+        UserError: a CUDA device without a usable GPU, or a name that torch does not know.
+    """
+    import torch
+
+    if device is None:
+        return "cuda:0" if torch.cuda.is_available() else "cpu"
+    try:
+        kind = torch.device(device).type
+    except RuntimeError as error:
+        raise UserError(
+            f"{device!r} is not a device. Use cpu, cuda, or cuda:0, cuda:1, ..."
+        ) from error
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise UserError(
+            f"--device {device} was asked for, but torch finds no CUDA GPU here "
+            f"(torch {torch.__version__}). Use --device cpu, or install a driver and a CUDA build "
+            "of torch."
+        )
+    return "cuda:0" if device == "cuda" else device
 
 
 def gpus_to_share(cfg: TrainConfig) -> list[int | str]:

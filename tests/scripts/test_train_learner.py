@@ -19,12 +19,13 @@ from process_runs import ProcessRun
 
 from mjlab.rl.config import RslRlOffPolicyRunnerCfg
 from mjlab.rl.learners import with_learner
-from mjlab.scripts import train_run
-from mjlab.scripts.evaluate_run import EvaluateConfig
+from mjlab.scripts import environments
+from mjlab.scripts.environments import make_env
+from mjlab.scripts.evaluate import EvaluateConfig
 from mjlab.scripts.live import Exchange, LiveJob, _env_to_show
-from mjlab.scripts.policy import _agent_cfg, env_cfg_of, load_policy, make_env
+from mjlab.scripts.policy import _agent_cfg, env_cfg_of, load_policy
 from mjlab.scripts.run_folder import read_run_info, write_run_info
-from mjlab.scripts.train_run import TrainConfig, parse_train_flags
+from mjlab.scripts.train import TrainConfig, parse_train_flags
 from mjlab.tasks import registry
 from mjlab.utils.processes import ProcessRank
 
@@ -74,7 +75,7 @@ def test_the_help_lists_the_flags_of_the_learner(run):
 def test_a_learner_that_does_not_exist_is_told_with_those_that_do(run, script):
     outcome = run(script, TASK, "--learner", "td3")
     assert outcome.status == 1
-    assert "Unknown learner 'td3'. Available: ppo, sac, distillation." in outcome.message
+    assert all(name in outcome.message for name in ("td3", "ppo", "sac", "distillation"))
 
 
 def test_counts_of_sac_are_checked(run):
@@ -104,11 +105,11 @@ def test_the_run_says_its_learner(of_sac):
 )
 def test_the_physics_leaves_a_core_to_sac(monkeypatch, tmp_path, flags, world_size, threads):
     monkeypatch.setattr("mjlab.sim.native.engine.cores_per_process", lambda: 3)
-    monkeypatch.setattr(train_run, "cores_per_process", lambda: 3)
+    monkeypatch.setattr(environments, "cores_per_process", lambda: 3)
     cfg = parse_train_flags(TASK, ["--learner", "sac", "--num-envs", "4", *flags], "train")
-    train_run._apply_short_forms(cfg, ProcessRank())
+    cfg.apply_short_forms(ProcessRank())
     before = cfg.env.sim.num_threads
-    env = train_run._build_env(cfg, "cpu", tmp_path, ProcessRank(0, world_size, 0, world_size))
+    env = environments.training_env(cfg, "cpu", tmp_path, ProcessRank(0, world_size, 0, world_size))
     try:
         assert env.unwrapped.sim.capabilities.num_threads == threads
         # Evaluations copy the config, and nothing is learned while they run.
@@ -249,7 +250,7 @@ def test_the_live_view_shows_it(tmp_path, monkeypatch):
     import viser
 
     from mjlab.rl import MjlabOnPolicyRunner
-    from mjlab.scripts.live_view import _make_viewer
+    from mjlab.scripts.live import _make_viewer
 
     cfg = TrainConfig.from_task(TASK, learner="sac")
     cfg.env.scene.num_envs = 2

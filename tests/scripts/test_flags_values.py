@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import pytest
 import torch
 
-from mjlab.scripts.cli import parse_flags
-from mjlab.scripts.train_run import parse_train_flags
+from mjlab.scripts.flags import parse_flags
+from mjlab.scripts.train import parse_train_flags
 
 TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
 ACTOR = "--env.observations.actor.terms"

@@ -1,4 +1,4 @@
-"""Starting one process for each GPU: their numbers, their signals, their end, their devices."""
+"""Starting several processes: their numbers, their signals, their end, their output."""
 
 from __future__ import annotations
 
@@ -8,15 +8,10 @@ import sys
 import time
 
 import pytest
-import torch
-from commands import TASK
 
-from mjlab.scripts import launcher
-from mjlab.scripts.cli import UserError
-from mjlab.scripts.launcher import launch_workers
-from mjlab.scripts.process_output import log_file, output_of
-from mjlab.scripts.train_run import TrainConfig
-from mjlab.scripts.training_device import gpus_to_share, training_device
+from mjlab.rl import distributed
+from mjlab.rl.distributed import launch_workers, log_file, output_of
+from mjlab.utils.errors import UserError
 from mjlab.utils.processes import ProcessRank
 
 PROGRAM = "import os, pathlib, signal, sys, time\nrank = os.environ['RANK']\n"
@@ -40,7 +35,7 @@ def test_every_process_gets_a_number_and_the_same_store(tmp_path):
 
 def test_processes_that_are_many_get_few_threads_each(tmp_path, monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    monkeypatch.setattr(launcher, "cores_per_process", lambda: 7)
+    monkeypatch.setattr(distributed, "cores_per_process", lambda: 7)
     code = f"pathlib.Path({str(tmp_path)!r}, rank).write_text(os.environ['OMP_NUM_THREADS'])"
     launch(code, 2)
     assert (tmp_path / "1").read_text() == "3"
@@ -51,7 +46,7 @@ def test_processes_that_are_many_get_few_threads_each(tmp_path, monkeypatch):
     [("sys.exit(5)", "failed with status 5"), ("os.kill(os.getpid(), 9)", "was ended by SIGKILL")],
 )
 def test_a_process_that_fails_ends_the_others_and_is_named(monkeypatch, end, how):
-    monkeypatch.setattr(launcher, "_PATIENCE", 0.3)
+    monkeypatch.setattr(distributed, "_PATIENCE", 0.3)
     begin = time.monotonic()
     with pytest.raises(UserError, match=f"Process 1 of 2 {how}"):
         launch(f"if rank == '1': {end}\ntime.sleep(60)")
@@ -74,7 +69,7 @@ def test_a_signal_goes_to_every_process_once_and_all_are_waited_for(tmp_path, na
         "(folder / f'ready_{rank}').touch()\ntime.sleep(30)\n"
     )
     parent = (
-        "import sys\nfrom mjlab.scripts.launcher import launch_workers\n"
+        "import sys\nfrom mjlab.rl.distributed import launch_workers\n"
         f"launch_workers([sys.executable, '-c', {child!r}], 2)\n"
     )
     process = subprocess.Popen([sys.executable, "-c", parent])
@@ -96,7 +91,7 @@ def test_a_killed_launcher_ends_its_workers(tmp_path):
         "(folder / f'ready_{rank}').touch()\ntime.sleep(30)\n"
     )
     parent = (
-        "import sys\nfrom mjlab.scripts.launcher import launch_workers\n"
+        "import sys\nfrom mjlab.rl.distributed import launch_workers\n"
         f"launch_workers([sys.executable, '-c', {child!r}], 2)\n"
     )
     process = subprocess.Popen([sys.executable, "-c", parent])
@@ -109,107 +104,6 @@ def test_a_killed_launcher_ends_its_workers(tmp_path):
     while len(list(tmp_path.glob("saved_*"))) < 2 and time.monotonic() < deadline:
         time.sleep(0.01)
     assert len(list(tmp_path.glob("saved_*"))) == 2
-
-
-@pytest.fixture
-def gpus(monkeypatch):
-    """Return a function that sets the number of GPUs and what is visible."""
-
-    def configure(count: int, visible: str | None = None) -> None:
-        monkeypatch.setattr(torch.cuda, "device_count", lambda: count)
-        monkeypatch.setattr(torch.cuda, "is_available", lambda: count > 0)
-        monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-        if visible is not None:
-            monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-
-    # So that it is put back, whatever is set.
-    monkeypatch.setenv("MUJOCO_EGL_DEVICE_ID", "0")
-    monkeypatch.delenv("MUJOCO_EGL_DEVICE_ID")
-    return configure
-
-
-def config(**changes) -> TrainConfig:
-    cfg = TrainConfig.from_task(TASK)
-    for name, value in changes.items():
-        setattr(cfg, name, value)
-    return cfg
-
-
-@pytest.mark.parametrize(
-    ("visible", "changes", "expected"),
-    [
-        (None, {"gpu_ids": [2, 0]}, [2, 0]),
-        (None, {"gpu_ids": "all"}, [0, 1, 2, 3]),
-        ("5,7", {"gpu_ids": "all"}, [5, 7]),
-        (None, {"gpu_ids": [1]}, []),
-        (None, {}, []),
-        (None, {"gpu_ids": None}, []),
-        ("", {"gpu_ids": [0, 1]}, []),
-        (None, {"gpu_ids": [0, 1], "device": "cpu"}, []),
-    ],
-)
-def test_the_gpus_of_a_run(gpus, visible, changes, expected):
-    gpus(4, visible)
-    assert gpus_to_share(config(**changes)) == expected
-
-
-def test_a_process_that_was_started_for_a_gpu_starts_no_others(gpus, monkeypatch):
-    gpus(2)
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    monkeypatch.setenv("RANK", "1")
-    assert gpus_to_share(config(gpu_ids="all")) == []
-
-
-def test_train_starts_a_process_for_each_gpu_with_the_same_flags(gpus, run, monkeypatch):
-    gpus(4, "4,5,6,7")
-    started = []
-    monkeypatch.setattr(launcher, "launch_workers", lambda *args: started.append(args))
-    outcome = run("train", TASK, "--gpu-ids", "[3,1]", "--num-envs", "8")
-    assert outcome.status == 0, outcome.err
-    ((command, count, environment),) = started
-    flags = ["--gpu-ids", "[3,1]", "--num-envs", "8", "--gpu-ids", "all"]
-    assert command == [sys.executable, "-m", "mjlab.scripts.train", TASK, *flags]
-    assert (count, environment) == (2, {"CUDA_VISIBLE_DEVICES": "7,5"})
-    assert run("train", TASK, "--gpu-ids", "all", "--agent.max-iterations", "0").status == 1
-    assert len(started) == 1
-
-
-@pytest.mark.parametrize(
-    ("visible", "changes", "rank", "device", "egl"),
-    [
-        (None, {}, (0, 1, 0, 1), "cuda:0", "0"),
-        (None, {"gpu_ids": [3]}, (0, 1, 0, 1), "cuda:3", "3"),
-        ("3,2", {"gpu_ids": [1]}, (0, 1, 0, 1), "cuda:1", "2"),
-        ("3,2", {"device": "cuda"}, (0, 1, 0, 1), "cuda:0", "3"),
-        ("3,2", {"gpu_ids": "all"}, (1, 2, 1, 2), "cuda:1", "2"),
-        (None, {}, (6, 8, 2, 4), "cuda:2", "2"),
-        (None, {"device": "cuda"}, (1, 2, 1, 2), "cuda:1", "1"),
-        (None, {"gpu_ids": [3, 1]}, (1, 2, 1, 2), "cuda:1", "1"),
-        (None, {"device": "cpu"}, (1, 2, 1, 2), "cpu", None),
-        (None, {"gpu_ids": None}, (1, 2, 1, 2), "cpu", None),
-        ("", {}, (1, 2, 1, 2), "cpu", None),
-    ],
-)
-def test_the_device_of_each_process(gpus, visible, changes, rank, device, egl):
-    import os
-
-    gpus(4, visible)
-    assert training_device(config(**changes), ProcessRank(*rank)) == device
-    assert os.environ.get("MUJOCO_EGL_DEVICE_ID") == egl
-
-
-@pytest.mark.parametrize(
-    ("changes", "rank", "message"),
-    [
-        ({}, (2, 3, 2, 3), "3 processes of the run and 2 GPUs"),
-        ({"device": "cuda:1"}, (0, 2, 0, 2), "--device cuda:1 is one GPU"),
-        ({"gpu_ids": [0, 1]}, (0, 1, 0, 1), "this is one process"),
-    ],
-)
-def test_processes_without_a_gpu_each_are_refused(gpus, changes, rank, message):
-    gpus(2)
-    with pytest.raises(UserError, match=message):
-        training_device(config(**changes), ProcessRank(*rank))
 
 
 def test_what_other_processes_print_goes_to_a_file(tmp_path, monkeypatch, capsys):
