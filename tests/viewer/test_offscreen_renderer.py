@@ -51,7 +51,7 @@ def test_wrong_order_of_calls_is_refused_with_what_to_do(monkeypatch) -> None:
 
 @pytest.mark.parametrize(
     ("fields", "message"),
-    [({"max_extra_envs": -1}, "max_extra_envs is -1"), ({"entity_name": "x"}, "not in the scene")],
+    [({"max_extra_envs": -1}, "max_extra_envs.*-1"), ({"entity_name": "x"}, "not in the scene")],
 )
 def test_bad_configurations_are_refused_before_any_drawing(fields, message) -> None:
     with pytest.raises(ValueError, match=message):
@@ -140,7 +140,7 @@ class TestPictures:
         side = picture(env, camera="side")
         assert differs(side, picture(env))
         assert not differs(side, picture(env, camera=0))
-        with pytest.raises(ValueError, match=r"no camera 'top'.*\['side'\]"):
+        with pytest.raises(ValueError, match=r"camera 'top'.*\['side'\]"):
             picture(env, camera="top")
 
     def test_neighbours_are_drawn_with_their_own_state(self) -> None:

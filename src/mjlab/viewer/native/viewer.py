@@ -1,4 +1,7 @@
-"""MuJoCo's own window, following one environment of a running policy."""
+"""MuJoCo's own window, following one environment of a running policy.
+
+The mouse pushes bodies (`MousePush`), and curves of the reward terms can be drawn over the picture.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ from mjlab.viewer.model_sync import (
     to_numpy,
 )
 from mjlab.viewer.native.keys import KEY_HELP, action_of_key
-from mjlab.viewer.native.visualizer import MujocoNativeDebugVisualizer
+from mjlab.viewer.native.visualizer import MujocoNativeDebugVisualizer, add_moving_geoms
 from mjlab.viewer.offscreen_renderer import RenderingUnavailableError, move_sun, prepare_sun
 
 if TYPE_CHECKING:
@@ -36,105 +39,10 @@ if TYPE_CHECKING:
     from mjlab.viewer.base import EnvProtocol, PolicyProtocol
 
 
-# MERGED mjlab.viewer.native.viewer: Whether this machine has a display to open a window on.
+log = logging.getLogger(__name__)
 
-
-def require_display() -> None:
-    """Check that a window can be opened.
-
-    Raises:
-        RenderingUnavailableError: There is no display. (GLFW itself would end the program.)
-    """
-    if sys.platform != "linux":
-        return
-    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise RenderingUnavailableError(
-            "MuJoCo's window needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set. "
-            "Use the browser viewer instead (--viewer viser)."
-        )
-    import glfw
-
-    if not glfw.init():
-        raise RenderingUnavailableError(
-            f"MuJoCo's window cannot open on DISPLAY={os.environ.get('DISPLAY')!r}: the display "
-            "server does not answer. Use the browser viewer instead (--viewer viser)."
-        )
-
-
-# MERGED mjlab.viewer.native.viewer: Pushing bodies with the mouse.
-
-
-class MousePush:
-    """Turns the window's mouse force into `qfrc_applied` of one environment.
-
-    Wrenches that tasks script stay in `xfrc_applied`, and generalised forces that a task wrote
-    itself are added to, not replaced: they are put back when the push ends.
-    """
-
-    def __init__(self, model: mujoco.MjModel):
-        self._model = model
-        self._env_idx: int | None = None
-        self._base: np.ndarray | None = None
-        self._written: np.ndarray | None = None
-
-    @property
-    def active(self) -> bool:
-        """Whether a force of the mouse stands in an environment."""
-        return self._env_idx is not None
-
-    def apply(
-        self, sim: Any, env_idx: int, data: mujoco.MjData, perturb: mujoco.MjvPerturb
-    ) -> None:
-        """Write the force of `perturb` for the next step; `data` holds the state it acts on."""
-        if not perturb.active or perturb.select <= 0:
-            self.release(sim)
-            return
-        force = self._generalised_force(data, perturb)
-        self._take_base(sim, env_idx)
-        assert self._base is not None
-        self._write(sim, env_idx, self._base + force)
-
-    def release(self, sim: Any) -> None:
-        """Take the push back; what the environment itself applies stays."""
-        if self._env_idx is None or self._base is None:
-            return
-        if self._is_ours(sim, self._env_idx):
-            self._write(sim, self._env_idx, self._base)
-        self._env_idx = self._base = self._written = None
-
-    def _take_base(self, sim: Any, env_idx: int) -> None:
-        if self._env_idx != env_idx:
-            self.release(sim)
-        # A reset or the task overwrote the row: what stands there now is the task's.
-        if self._base is None or not self._is_ours(sim, env_idx):
-            self._base = _row(sim, env_idx)
-        self._env_idx = env_idx
-
-    def _is_ours(self, sim: Any, env_idx: int) -> bool:
-        return self._written is not None and np.array_equal(_row(sim, env_idx), self._written)
-
-    def _write(self, sim: Any, env_idx: int, force: np.ndarray) -> None:
-        rows = sim.data.qfrc_applied
-        rows[env_idx] = torch.as_tensor(force, dtype=rows.dtype, device=rows.device)
-        self._written = _row(sim, env_idx)
-
-    def _generalised_force(self, data: mujoco.MjData, perturb: mujoco.MjvPerturb) -> np.ndarray:
-        scripted = data.xfrc_applied.copy()
-        data.xfrc_applied[:] = 0.0
-        mujoco.mjv_applyPerturbForce(self._model, data, perturb)
-        wrench = data.xfrc_applied[perturb.select].copy()
-        data.xfrc_applied[:] = scripted
-        force = np.zeros(self._model.nv)
-        point = data.xipos[perturb.select].copy()
-        mujoco.mj_applyFT(self._model, data, wrench[:3], wrench[3:], point, perturb.select, force)
-        return force
-
-
-def _row(sim: Any, env_idx: int) -> np.ndarray:
-    return to_numpy(sim.data.qfrc_applied[env_idx]).copy()
-
-
-# MERGED mjlab.viewer.native.viewer: Curves of the reward terms, drawn over the native window.
+_MARKER_COLOR = (0.9, 0.1, 0.1, 0.9)
+_CLOSING_TIMEOUT_S = 5.0
 
 
 @dataclass
@@ -165,6 +73,352 @@ class PlotCfg:
     """Fraction of the window's width that all columns together take."""
     background_alpha: float = 0.5
     """Opacity of the plots' black background."""
+
+
+class NativeMujocoViewer(BaseViewer):
+    """Shows one environment, its nearest neighbours, rewards and debug drawings in a window.
+
+    Double-click selects a body, Ctrl-drag pushes or twists it. Keys are listed in the window;
+    they are ones that MuJoCo's window does not use itself. What is computed for display (contacts,
+    say) comes from a CPU forward pass, also where the environment runs on a GPU.
+
+    Attributes:
+        mjm: Private copy of the model, with the values of the environment in view.
+        mjd: State of the environment in view.
+        env_idx: Environment in view.
+    """
+
+    def __init__(
+        self,
+        env: EnvProtocol,
+        policy: PolicyProtocol,
+        frame_rate: float = 60.0,
+        key_callback: Callable[[int], None] | None = None,
+        plot_cfg: PlotCfg | None = None,
+        enable_perturbations: bool = True,
+        verbosity: int = VerbosityLevel.SILENT,
+    ) -> None:
+        """Prepare; the window opens in `run` (or `setup`).
+
+        Args:
+            env: Environment or wrapper whose observations `policy` takes.
+            policy: Maps observations to actions.
+            frame_rate: Displayed frames per second of wall time.
+            key_callback: Also called with every key (GLFW code), in the window's thread.
+            plot_cfg: Size and range of the reward plots.
+            enable_perturbations: Let the mouse push bodies.
+            verbosity: How much to log, a `VerbosityLevel`.
+        """
+        super().__init__(env, policy, frame_rate, verbosity)
+        self._user_key_callback = key_callback
+        self._enable_perturbations = enable_perturbations
+        unwrapped = env.unwrapped
+        self.mjm = host_model(unwrapped.sim.mj_model)
+        prepare_sun(self.mjm, self.cfg.distance)
+        # Neighbours are posed in a model of their own, so that the window's is changed only
+        # while it is locked.
+        self._extra_model = host_model(unwrapped.sim.mj_model)
+        self.mjd = mujoco.MjData(self.mjm)
+        self._extra_data = mujoco.MjData(self._extra_model)
+        self._view = resolve_camera(self.cfg, self.mjm, unwrapped.scene.entities)
+        if self._view.fovy is not None:
+            self.mjm.vis.global_.fovy = self._view.fovy
+        self._marked_body = (
+            self._view.body_id if self._view.body_id is not None else first_moving_body(self.mjm)
+        )
+        self.env_idx = min(max(self.cfg.env_idx, 0), unwrapped.num_envs - 1)
+        self._plot_cfg = plot_cfg if plot_cfg is not None else PlotCfg()
+        self._rewards = TermHistory(self._plot_cfg.history)
+        self._push = MousePush(self.mjm)
+        self._show_plots = False
+        self._show_debug_vis = True
+        self._show_all_envs = False
+        self._handle: mujoco.viewer.Handle | None = None
+        self._window_threads: set[threading.Thread] = set()
+        self._visualizer: MujocoNativeDebugVisualizer | None = None
+
+    def setup(self) -> None:
+        """Open the window.
+
+        Raises:
+            RenderingUnavailableError: There is no display.
+        """
+        require_display()
+        import mujoco.viewer
+
+        self._load_selected()
+        others = set(threading.enumerate())
+        try:
+            self._handle = mujoco.viewer.launch_passive(
+                self.mjm,
+                self.mjd,
+                key_callback=self._on_key,
+                show_left_ui=False,
+                show_right_ui=False,
+            )
+        except Exception as error:
+            raise RenderingUnavailableError(
+                f"Cannot open MuJoCo's window: {error}. Use the browser viewer (--viewer viser)."
+            ) from error
+        self._window_threads = set(threading.enumerate()) - others
+        with self._handle.lock():
+            self._configure_window(self._handle)
+
+    def is_running(self) -> bool:
+        return self._handle is not None and self._handle.is_running()
+
+    def close(self) -> None:
+        if self._handle is not None:
+            self._push.release(self.env.unwrapped.sim)
+            self._handle.close()
+            self._handle = None
+        # The window's thread draws a last frame after it was told to end. A program that ends
+        # meanwhile takes the graphics library away from under it, and crashes.
+        for thread in self._window_threads:
+            thread.join(timeout=_CLOSING_TIMEOUT_S)
+        self._window_threads = set()
+
+    def sync_env_to_viewer(self) -> None:
+        handle = self._handle
+        if handle is None or not handle.is_running():
+            return
+        with handle.lock():
+            self._load_selected()
+            self._update_debug_visualizers(handle)
+            if self._view.body_id is not None and self._com_differs:
+                handle.cam.lookat[:] = self._view.target(self.mjd.xpos)
+            if self.env.unwrapped.num_envs > 1:
+                self._mark_selected(self._visualizer_of(handle.user_scn))
+                self._draw_neighbours(handle.user_scn)
+        handle.set_texts(self._overlay())
+        if self._show_plots and handle.viewport is not None:
+            handle.set_figures(reward_figures(self._rewards, handle.viewport, self._plot_cfg))
+        handle.sync()
+
+    def sync_viewer_to_env(self) -> None:
+        handle = self._handle
+        if handle is None or not self._enable_perturbations:
+            return
+        # Without a push there is nothing to wait for the window's lock for.
+        if handle.perturb.active or self._push.active:
+            with handle.lock():
+                self._push.apply(self.env.unwrapped.sim, self.env_idx, self.mjd, handle.perturb)
+
+    def after_env_step(self) -> None:
+        manager = self.env.unwrapped.reward_manager
+        self._rewards.add(manager.get_active_iterable_terms(self.env_idx))
+
+    def after_reset(self) -> None:
+        self._rewards.clear()
+
+    def on_paused(self, paused: bool) -> None:
+        self.env.unwrapped.command_manager.on_viewer_pause(paused)
+
+    def handle_action(self, action: ViewerAction, payload: Any) -> bool:
+        if action in (ViewerAction.PREV_ENV, ViewerAction.NEXT_ENV):
+            self.select_env(self.env_idx + (1 if action is ViewerAction.NEXT_ENV else -1))
+        elif action is ViewerAction.TOGGLE_PLOTS:
+            self._show_plots = not self._show_plots
+            if not self._show_plots and self._handle is not None:
+                self._handle.clear_figures()
+        elif action is ViewerAction.TOGGLE_DEBUG_VIS:
+            self._show_debug_vis = not self._show_debug_vis
+        elif action is ViewerAction.TOGGLE_SHOW_ALL_ENVS:
+            self._show_all_envs = not self._show_all_envs
+        else:
+            return False
+        return True
+
+    def select_env(self, env_idx: int) -> None:
+        """Show another environment; numbers wrap around. A push on the old one ends."""
+        self._push.release(self.env.unwrapped.sim)
+        self.env_idx = env_idx % self.env.unwrapped.num_envs
+        self._rewards.clear()
+
+    def _on_key(self, key: int) -> None:
+        # This is the window's thread; the main thread performs the action.
+        action = action_of_key(key)
+        if action is not None:
+            self.request_action(action.value)
+        if self._user_key_callback is not None:
+            self._user_key_callback(key)
+
+    def _configure_window(self, handle: mujoco.viewer.Handle) -> None:
+        camera = handle.cam
+        camera.lookat[:] = self._view.target(self.mjd.xpos)
+        camera.distance = self._view.distance
+        camera.azimuth = self._view.azimuth
+        camera.elevation = self._view.elevation
+        if self._view.body_id is not None and not self._com_differs:
+            camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+            camera.trackbodyid = self._view.body_id
+        handle.opt.frame = mujoco.mjtFrame.mjFRAME_WORLD
+        handle.opt.flags[mujoco.mjtVisFlag.mjVIS_SCLINERTIA] = 1
+        handle.opt.geomgroup[:] = self.cfg.geom_group
+        handle.opt.sitegroup[:] = self.cfg.site_group
+        flags = handle.user_scn.flags
+        flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self.cfg.enable_shadows
+        flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = self.cfg.enable_reflections
+
+    def _load_selected(self) -> None:
+        sim = self.env.unwrapped.sim
+        sync_model_fields(self.mjm, sim.model, sim.expanded_fields, self.env_idx)
+        copy_state(sim, self.env_idx, self.mjd)
+        mujoco.mj_forward(self.mjm, self.mjd)
+        move_sun(self.mjm, self.mjd, self._view.target(self.mjd.xpos))
+
+    def _update_debug_visualizers(self, viewer: mujoco.viewer.Handle) -> None:
+        """Replace the geoms of `viewer.user_scn` by the environment's debug drawings.
+
+        Called for every displayed frame with the window locked, also while `_show_debug_vis` is
+        False. Subclasses may extend it to draw more.
+        """
+        viewer.user_scn.ngeom = 0
+        if self._show_debug_vis:
+            visualizer = self._visualizer_of(viewer.user_scn)
+            visualizer.begin(self.env_idx, self._show_all_envs)
+            self.env.unwrapped.update_visualizers(visualizer)
+
+    def _visualizer_of(self, scn: mujoco.MjvScene) -> MujocoNativeDebugVisualizer:
+        if self._visualizer is None or self._visualizer.scn is not scn:
+            self._visualizer = MujocoNativeDebugVisualizer(scn, self.mjm)
+        return self._visualizer
+
+    @property
+    def _com_differs(self) -> bool:
+        """True if the center of mass, which a tracking camera follows, differs per environment.
+
+        The camera then follows the body's origin, so that it does not jump between environments.
+        """
+        return bool(self.env.unwrapped.sim.expanded_fields & VIEWER_INERTIAL_FIELDS)
+
+    def _mark_selected(self, visualizer: MujocoNativeDebugVisualizer) -> None:
+        """Hang a red arrow over the followed body of the environment in view."""
+        if self._marked_body is None:
+            return
+        tip = self.mjd.xpos[self._marked_body] + np.array([0.0, 0.0, 0.5])
+        visualizer.add_arrow(tip + np.array([0.0, 0.0, 0.4]), tip, _MARKER_COLOR, width=0.03)
+
+    def _draw_neighbours(self, scn: mujoco.MjvScene) -> None:
+        env, sim = self.env.unwrapped, self.env.unwrapped.sim
+        origins = to_numpy(env.scene.env_origins)
+        option = mujoco.MjvOption()
+        option.geomgroup[:] = self.cfg.geom_group
+        option.sitegroup[:] = self.cfg.site_group
+        for env_idx in nearest_envs(origins, self.env_idx, self.cfg.max_extra_envs):
+            sync_model_fields(self._extra_model, sim.model, sim.expanded_fields, env_idx)
+            copy_state(sim, env_idx, self._extra_data)
+            compute_poses(self._extra_model, self._extra_data)
+            add_moving_geoms(scn, self._extra_model, self._extra_data, option)
+
+    def _overlay(self) -> list[tuple[int | None, int | None, str | None, str | None]]:
+        status = self.get_status()
+        state = "paused" if status.paused else "CAPPED" if status.capped else "running"
+        rows = [
+            ("env", f"{self.env_idx + 1}/{self.env.unwrapped.num_envs}"),
+            ("step", f"{status.step_count}"),
+            ("status", state),
+            ("speed", status.speed_label),
+            (
+                "real time",
+                f"{status.actual_realtime:.2f}x of {status.target_realtime:g}x"
+                f" ({status.smoothed_fps:.0f} FPS)",
+            ),
+        ]
+        if status.last_error is not None:
+            rows.append(("error", status.last_error[:80]))
+        font = int(mujoco.mjtFontScale.mjFONTSCALE_150)
+        top, bottom = mujoco.mjtGridPos.mjGRID_TOPLEFT, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
+        names, values = ("\n".join(column) for column in zip(*rows, strict=True))
+        keys, meanings = ("\n".join(column) for column in zip(*KEY_HELP, strict=True))
+        return [(font, int(top), names, values), (font, int(bottom), keys, meanings)]
+
+
+def require_display() -> None:
+    """Check that a window can be opened.
+
+    Raises:
+        RenderingUnavailableError: There is no display. (GLFW itself would end the program.)
+    """
+    if sys.platform != "linux":
+        return
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise RenderingUnavailableError(
+            "MuJoCo's window needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set. "
+            "Use the browser viewer instead (--viewer viser)."
+        )
+    import glfw
+
+    if not glfw.init():
+        raise RenderingUnavailableError(
+            f"MuJoCo's window cannot open on DISPLAY={os.environ.get('DISPLAY')!r}: the display "
+            "server does not answer. Use the browser viewer instead (--viewer viser)."
+        )
+
+
+class MousePush:
+    """Turns the window's mouse force into `qfrc_applied` of one environment.
+
+    Wrenches that tasks script stay in `xfrc_applied`, and generalised forces that a task wrote
+    itself are added to, not replaced: they are put back when the push ends.
+    """
+
+    def __init__(self, model: mujoco.MjModel):
+        self._model = model
+        self._env_idx: int | None = None
+        self._base: np.ndarray | None = None
+        self._written: np.ndarray | None = None
+
+    @property
+    def active(self) -> bool:
+        """Whether a force of the mouse stands in an environment."""
+        return self._env_idx is not None
+
+    def apply(
+        self, sim: Any, env_idx: int, data: mujoco.MjData, perturb: mujoco.MjvPerturb
+    ) -> None:
+        """Write the force of `perturb` for the next step; `data` holds the state it acts on."""
+        if not perturb.active or perturb.select <= 0:
+            self.release(sim)
+            return
+        if self._env_idx != env_idx:
+            self.release(sim)
+        # A reset or the task overwrote the row: what stands there now is the task's.
+        if self._base is None or not self._is_ours(sim, env_idx):
+            self._base = _row(sim, env_idx)
+        self._env_idx = env_idx
+        self._write(sim, env_idx, self._base + self._generalised_force(data, perturb))
+
+    def release(self, sim: Any) -> None:
+        """Take the push back; what the environment itself applies stays."""
+        if self._env_idx is None or self._base is None:
+            return
+        if self._is_ours(sim, self._env_idx):
+            self._write(sim, self._env_idx, self._base)
+        self._env_idx = self._base = self._written = None
+
+    def _is_ours(self, sim: Any, env_idx: int) -> bool:
+        return self._written is not None and np.array_equal(_row(sim, env_idx), self._written)
+
+    def _write(self, sim: Any, env_idx: int, force: np.ndarray) -> None:
+        rows = sim.data.qfrc_applied
+        rows[env_idx] = torch.as_tensor(force, dtype=rows.dtype, device=rows.device)
+        self._written = _row(sim, env_idx)
+
+    def _generalised_force(self, data: mujoco.MjData, perturb: mujoco.MjvPerturb) -> np.ndarray:
+        scripted = data.xfrc_applied.copy()
+        data.xfrc_applied[:] = 0.0
+        mujoco.mjv_applyPerturbForce(self._model, data, perturb)
+        wrench = data.xfrc_applied[perturb.select].copy()
+        data.xfrc_applied[:] = scripted
+        force = np.zeros(self._model.nv)
+        point = data.xipos[perturb.select].copy()
+        mujoco.mj_applyFT(self._model, data, wrench[:3], wrench[3:], point, perturb.select, force)
+        return force
+
+
+def _row(sim: Any, env_idx: int) -> np.ndarray:
+    return to_numpy(sim.data.qfrc_applied[env_idx]).copy()
 
 
 def reward_figures(
@@ -258,280 +512,3 @@ def _figure(name: str, values: np.ndarray, cfg: PlotCfg) -> mujoco.MjvFigure:
     figure.linedata[0, 0 : 2 * count : 2] = steps[shown]
     figure.linedata[0, 1 : 2 * count : 2] = np.clip(latest[shown] / 10.0**exponent, low, high)
     return figure
-
-
-log = logging.getLogger(__name__)
-_MARKER_COLOR = (0.9, 0.1, 0.1, 0.9)
-_CLOSING_TIMEOUT_S = 5.0
-_NO_PERTURBATION = mujoco.MjvPerturb()
-
-
-class NativeMujocoViewer(BaseViewer):
-    """Shows one environment, its nearest neighbours, rewards and debug drawings in a window.
-
-    Double-click selects a body, Ctrl-drag pushes or twists it. Keys are listed in the window;
-    they are ones that MuJoCo's window does not use itself. What is computed for display (contacts,
-    say) comes from a CPU forward pass, also where the environment runs on a GPU.
-
-    Attributes:
-        mjm: Private copy of the model, with the values of the environment in view.
-        mjd: State of the environment in view.
-        env_idx: Environment in view.
-    """
-
-    def __init__(
-        self,
-        env: EnvProtocol,
-        policy: PolicyProtocol,
-        frame_rate: float = 60.0,
-        key_callback: Callable[[int], None] | None = None,
-        plot_cfg: PlotCfg | None = None,
-        enable_perturbations: bool = True,
-        verbosity: int = VerbosityLevel.SILENT,
-    ) -> None:
-        """Prepare; the window opens in `run` (or `setup`).
-
-        Args:
-            env: Environment or wrapper whose observations `policy` takes.
-            policy: Maps observations to actions.
-            frame_rate: Displayed frames per second of wall time.
-            key_callback: Also called with every key (GLFW code), in the window's thread.
-            plot_cfg: Size and range of the reward plots.
-            enable_perturbations: Let the mouse push bodies.
-            verbosity: How much to log, a `VerbosityLevel`.
-        """
-        super().__init__(env, policy, frame_rate, verbosity)
-        self._user_key_callback = key_callback
-        self._enable_perturbations = enable_perturbations
-        unwrapped = env.unwrapped
-        self.mjm = host_model(unwrapped.sim.mj_model)
-        prepare_sun(self.mjm, self.cfg.distance)
-        # Neighbours are posed in a model of their own, so that the window's is changed only
-        # while it is locked.
-        self._extra_model = host_model(unwrapped.sim.mj_model)
-        self.mjd = mujoco.MjData(self.mjm)
-        self._extra_data = mujoco.MjData(self._extra_model)
-        self._view = resolve_camera(self.cfg, self.mjm, unwrapped.scene.entities)
-        if self._view.fovy is not None:
-            self.mjm.vis.global_.fovy = self._view.fovy
-        self._marked_body = (
-            self._view.body_id if self._view.body_id is not None else first_moving_body(self.mjm)
-        )
-        self.env_idx = min(max(self.cfg.env_idx, 0), unwrapped.num_envs - 1)
-        self._plot_cfg = plot_cfg if plot_cfg is not None else PlotCfg()
-        self._rewards = TermHistory(self._plot_cfg.history)
-        self._push = MousePush(self.mjm)
-        self._show_plots = False
-        self._show_debug_vis = True
-        self._show_all_envs = False
-        self._handle: mujoco.viewer.Handle | None = None
-        self._window_threads: set[threading.Thread] = set()
-        self._visualizer: MujocoNativeDebugVisualizer | None = None
-
-    def setup(self) -> None:
-        """Open the window.
-
-        Raises:
-            RenderingUnavailableError: There is no display.
-        """
-        require_display()
-        import mujoco.viewer
-
-        self._load_selected()
-        others = set(threading.enumerate())
-        try:
-            self._handle = mujoco.viewer.launch_passive(
-                self.mjm,
-                self.mjd,
-                key_callback=self._on_key,
-                show_left_ui=False,
-                show_right_ui=False,
-            )
-        except Exception as error:
-            raise RenderingUnavailableError(
-                f"Cannot open MuJoCo's window: {error}. Use the browser viewer (--viewer viser)."
-            ) from error
-        self._window_threads = set(threading.enumerate()) - others
-        self._configure_window(self._handle)
-
-    def is_running(self) -> bool:
-        return self._handle is not None and self._handle.is_running()
-
-    def close(self) -> None:
-        if self._handle is not None:
-            self._push.release(self.env.unwrapped.sim)
-            self._handle.close()
-            self._handle = None
-        # The window's thread draws a last frame after it was told to end. A program that ends
-        # meanwhile takes the graphics library away from under it, and crashes.
-        for thread in self._window_threads:
-            thread.join(timeout=_CLOSING_TIMEOUT_S)
-        self._window_threads = set()
-
-    def sync_env_to_viewer(self) -> None:
-        handle = self._handle
-        if handle is None or not handle.is_running():
-            return
-        with handle.lock():
-            self._load_selected()
-            self._draw_extras(handle)
-        handle.set_texts(self._overlay())
-        if self._show_plots and handle.viewport is not None:
-            handle.set_figures(reward_figures(self._rewards, handle.viewport, self._plot_cfg))
-        handle.sync()
-
-    def sync_viewer_to_env(self) -> None:
-        handle = self._handle
-        if handle is None or not self._enable_perturbations:
-            return
-        # Without a push there is nothing to wait for the window's lock for.
-        if handle.perturb.active or self._push.active:
-            with handle.lock():
-                self._push.apply(self.env.unwrapped.sim, self.env_idx, self.mjd, handle.perturb)
-
-    def after_env_step(self) -> None:
-        manager = self.env.unwrapped.reward_manager
-        self._rewards.add(manager.get_active_iterable_terms(self.env_idx))
-
-    def after_reset(self) -> None:
-        self._rewards.clear()
-
-    def on_paused(self, paused: bool) -> None:
-        self.env.unwrapped.command_manager.on_viewer_pause(paused)
-
-    def handle_action(self, action: ViewerAction, payload: Any) -> bool:
-        if action in (ViewerAction.PREV_ENV, ViewerAction.NEXT_ENV):
-            self.select_env(self.env_idx + (1 if action is ViewerAction.NEXT_ENV else -1))
-        elif action is ViewerAction.TOGGLE_PLOTS:
-            self._show_plots = not self._show_plots
-            if not self._show_plots and self._handle is not None:
-                self._handle.clear_figures()
-        elif action is ViewerAction.TOGGLE_DEBUG_VIS:
-            self._show_debug_vis = not self._show_debug_vis
-        elif action is ViewerAction.TOGGLE_SHOW_ALL_ENVS:
-            self._show_all_envs = not self._show_all_envs
-        else:
-            return False
-        return True
-
-    def select_env(self, env_idx: int) -> None:
-        """Show another environment; numbers wrap around. A push on the old one ends."""
-        self._push.release(self.env.unwrapped.sim)
-        self.env_idx = env_idx % self.env.unwrapped.num_envs
-        self._rewards.clear()
-
-    def _on_key(self, key: int) -> None:
-        # This is the window's thread; the main thread performs the action.
-        action = action_of_key(key)
-        if action is not None:
-            self.request_action(action.value)
-        if self._user_key_callback is not None:
-            self._user_key_callback(key)
-
-    def _configure_window(self, handle: mujoco.viewer.Handle) -> None:
-        with handle.lock():
-            camera = handle.cam
-            camera.lookat[:] = self._view.target(self.mjd.xpos)
-            camera.distance = self._view.distance
-            camera.azimuth = self._view.azimuth
-            camera.elevation = self._view.elevation
-            if self._view.body_id is not None and not self._com_differs:
-                camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
-                camera.trackbodyid = self._view.body_id
-            handle.opt.frame = mujoco.mjtFrame.mjFRAME_WORLD
-            handle.opt.flags[mujoco.mjtVisFlag.mjVIS_SCLINERTIA] = 1
-            handle.opt.geomgroup[:] = self.cfg.geom_group
-            handle.opt.sitegroup[:] = self.cfg.site_group
-            flags = handle.user_scn.flags
-            flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self.cfg.enable_shadows
-            flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = self.cfg.enable_reflections
-
-    def _load_selected(self) -> None:
-        sim = self.env.unwrapped.sim
-        if sim.expanded_fields:
-            sync_model_fields(self.mjm, sim.model, sim.expanded_fields, self.env_idx)
-        copy_state(sim, self.env_idx, self.mjd)
-        mujoco.mj_forward(self.mjm, self.mjd)
-        move_sun(self.mjm, self.mjd, self._view.target(self.mjd.xpos))
-
-    def _draw_extras(self, viewer: mujoco.viewer.Handle) -> None:
-        self._update_debug_visualizers(viewer)
-        if self._view.body_id is not None and self._com_differs:
-            viewer.cam.lookat[:] = self._view.target(self.mjd.xpos)
-        if self.env.unwrapped.num_envs > 1:
-            self._mark_selected(self._visualizer_of(viewer.user_scn))
-            self._draw_neighbours(viewer.user_scn)
-
-    def _update_debug_visualizers(self, viewer: mujoco.viewer.Handle) -> None:
-        """Replace the geoms of `viewer.user_scn` by the environment's debug drawings.
-
-        Called for every displayed frame with the window locked, also while `_show_debug_vis` is
-        False. Subclasses may extend it to draw more.
-        """
-        viewer.user_scn.ngeom = 0
-        if self._show_debug_vis:
-            visualizer = self._visualizer_of(viewer.user_scn)
-            visualizer.begin(self.env_idx, self._show_all_envs)
-            self.env.unwrapped.update_visualizers(visualizer)
-
-    def _visualizer_of(self, scn: mujoco.MjvScene) -> MujocoNativeDebugVisualizer:
-        if self._visualizer is None or self._visualizer.scn is not scn:
-            self._visualizer = MujocoNativeDebugVisualizer(scn, self.mjm)
-        return self._visualizer
-
-    @property
-    def _com_differs(self) -> bool:
-        """True if the center of mass, which a tracking camera follows, differs per environment.
-
-        The camera then follows the body's origin, so that it does not jump between environments.
-        """
-        return bool(self.env.unwrapped.sim.expanded_fields & VIEWER_INERTIAL_FIELDS)
-
-    def _mark_selected(self, visualizer: MujocoNativeDebugVisualizer) -> None:
-        """Hang a red arrow over the followed body of the environment in view."""
-        if self._marked_body is None:
-            return
-        tip = self.mjd.xpos[self._marked_body] + np.array([0.0, 0.0, 0.5])
-        visualizer.add_arrow(tip + np.array([0.0, 0.0, 0.4]), tip, _MARKER_COLOR, width=0.03)
-
-    def _draw_neighbours(self, scn: mujoco.MjvScene) -> None:
-        env, sim = self.env.unwrapped, self.env.unwrapped.sim
-        origins = to_numpy(env.scene.env_origins)
-        option = mujoco.MjvOption()
-        option.geomgroup[:] = self.cfg.geom_group
-        option.sitegroup[:] = self.cfg.site_group
-        for env_idx in nearest_envs(origins, self.env_idx, self.cfg.max_extra_envs):
-            if sim.expanded_fields:
-                sync_model_fields(self._extra_model, sim.model, sim.expanded_fields, env_idx)
-            copy_state(sim, env_idx, self._extra_data)
-            compute_poses(self._extra_model, self._extra_data)
-            mujoco.mjv_addGeoms(
-                self._extra_model,
-                self._extra_data,
-                option,
-                _NO_PERTURBATION,
-                int(mujoco.mjtCatBit.mjCAT_DYNAMIC),
-                scn,
-            )
-
-    def _overlay(self) -> list[tuple[int | None, int | None, str | None, str | None]]:
-        status = self.get_status()
-        state = "paused" if status.paused else "CAPPED" if status.capped else "running"
-        rows = [
-            ("env", f"{self.env_idx + 1}/{self.env.unwrapped.num_envs}"),
-            ("step", f"{status.step_count}"),
-            ("status", state),
-            ("speed", status.speed_label),
-            (
-                "real time",
-                f"{status.actual_realtime:.2f}x of {status.target_realtime:g}x"
-                f" ({status.smoothed_fps:.0f} FPS)",
-            ),
-        ]
-        if status.last_error is not None:
-            rows.append(("error", status.last_error[:80]))
-        font = int(mujoco.mjtFontScale.mjFONTSCALE_150)
-        top, bottom = mujoco.mjtGridPos.mjGRID_TOPLEFT, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
-        names, values = ("\n".join(column) for column in zip(*rows, strict=True))
-        keys, meanings = ("\n".join(column) for column in zip(*KEY_HELP, strict=True))
-        return [(font, int(top), names, values), (font, int(bottom), keys, meanings)]
