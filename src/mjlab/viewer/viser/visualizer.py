@@ -1,4 +1,4 @@
-"""TODO."""
+"""Debug drawing in the browser: primitives of one kind are sent as one batch."""
 
 from __future__ import annotations
 
@@ -15,72 +15,11 @@ from mjviser.conversions import is_fixed_body, merge_geoms
 from mjlab.viewer.debug_visualizer import MIN_LENGTH, Color, DebugVisualizer, pose_ghost
 from mjlab.viewer.model_sync import compute_poses, to_numpy
 
-# MERGED mjlab.viewer.viser.visualizer: Debug drawing in the browser: primitives of one kind are sent as one batch.
-
 Array = np.ndarray | torch.Tensor
+
 _HEAD_FRACTION = 0.2
 _HEAD_WIDENING = 2.0
 _MAX_GHOST_GEOM_GROUP = 2
-
-
-def _unit_meshes() -> dict[str, trimesh.Trimesh]:
-    return {
-        "shaft": trimesh.creation.cylinder(radius=1.0, height=1.0, sections=16),
-        "head": trimesh.creation.cone(radius=1.0, height=1.0, sections=16),
-        "sphere": trimesh.creation.icosphere(subdivisions=2, radius=1.0),
-        "box": trimesh.creation.box(extents=(2.0, 2.0, 2.0)),
-    }
-
-
-@dataclass
-class _Batch:
-    """Items of one mesh: position, rotation, size, colour and opacity of each."""
-
-    positions: list[np.ndarray] = field(default_factory=list)
-    wxyzs: list[np.ndarray] = field(default_factory=list)
-    scales: list[np.ndarray] = field(default_factory=list)
-    colors: list[Color] = field(default_factory=list)
-
-    def add(self, position, wxyz, scale, color: Color) -> None:
-        self.positions.append(np.array(to_numpy(position), dtype=np.float32))
-        self.wxyzs.append(wxyz)
-        self.scales.append(to_numpy(scale))
-        self.colors.append(color)
-
-    def extend(self, positions, wxyzs, scales, colors: list[Color]) -> None:
-        """Add a row of each array (n, ...) as an item."""
-        self.positions.extend(positions)
-        self.wxyzs.extend(wxyzs)
-        self.scales.extend(scales)
-        self.colors.extend(colors)
-
-
-@dataclass
-class _Arrows:
-    """Arrows of a frame. They are many, so that their directions are computed all at once."""
-
-    starts: list[np.ndarray] = field(default_factory=list)
-    ends: list[np.ndarray] = field(default_factory=list)
-    widths: list[float] = field(default_factory=list)
-    colors: list[Color] = field(default_factory=list)
-
-    def add_to(self, shafts: _Batch, heads: _Batch) -> None:
-        """Add what the arrows that have a direction consist of."""
-        starts = np.array(self.starts, dtype=float).reshape(-1, 3)
-        vectors = np.array(self.ends, dtype=float).reshape(-1, 3) - starts
-        lengths = np.linalg.norm(vectors, axis=1)
-        kept = np.flatnonzero(lengths >= MIN_LENGTH)
-        starts, lengths = starts[kept], lengths[kept, None]
-        axes = vectors[kept] / lengths
-        wxyzs = _rotations_of_z(axes)
-        widths = np.array(self.widths, dtype=float)[kept, None]
-        colors = [self.colors[i] for i in kept]
-        shaft, head = (1.0 - _HEAD_FRACTION) * lengths, _HEAD_FRACTION * lengths
-        shafts.extend(
-            starts + 0.5 * shaft * axes, wxyzs, np.hstack((widths, widths, shaft)), colors
-        )
-        radii = _HEAD_WIDENING * widths
-        heads.extend(starts + shaft * axes, wxyzs, np.hstack((radii, radii, head)), colors)
 
 
 class ViserDebugVisualizer(DebugVisualizer):
@@ -92,7 +31,12 @@ class ViserDebugVisualizer(DebugVisualizer):
     def __init__(self, server: viser.ViserServer, model: mujoco.MjModel):
         self._server = server
         self._model = model
-        self._meshes = _unit_meshes()
+        self._meshes = {
+            "shaft": trimesh.creation.cylinder(radius=1.0, height=1.0, sections=16),
+            "head": trimesh.creation.cone(radius=1.0, height=1.0, sections=16),
+            "sphere": trimesh.creation.icosphere(subdivisions=2, radius=1.0),
+            "box": trimesh.creation.box(extents=(2.0, 2.0, 2.0)),
+        }
         self._batches: dict[str, _Batch] = {}
         self._arrows = _Arrows()
         self._debug_handles: dict[str, viser.BatchedMeshHandle] = {}
@@ -136,10 +80,11 @@ class ViserDebugVisualizer(DebugVisualizer):
         label: str | None = None,
     ) -> None:
         start, end = to_numpy(start).reshape(3), to_numpy(end).reshape(3)
-        length, wxyz, axis = _direction(start, end)
+        vector = end.astype(float) - start
+        length = float(np.linalg.norm(vector))
         if length >= MIN_LENGTH:
-            middle = start + 0.5 * length * axis
-            self._add("shaft", middle, wxyz, (radius, radius, length), color)
+            [wxyz] = rotations_of_z(vector[None] / length)
+            self._add("shaft", start + 0.5 * vector, wxyz, (radius, radius, length), color)
 
     def add_sphere(
         self, center: Array, radius: float, color: Color, label: str | None = None
@@ -176,8 +121,17 @@ class ViserDebugVisualizer(DebugVisualizer):
         label: str | None = None,
     ) -> None:
         if id(model) not in self._ghosts:
+            shown = [
+                geom_id
+                for geom_id in range(model.ngeom)
+                if model.geom_group[geom_id] <= _MAX_GHOST_GEOM_GROUP
+                and _geom_rgba(model, geom_id)[3] > 0
+                and not is_fixed_body(model, int(model.geom_bodyid[geom_id]))
+            ]
+            for geom_id in shown:
+                self._meshes[_ghost_key(model, geom_id)] = merge_geoms(model, [geom_id])
             # The model is kept too, so that its id cannot be reused by another model.
-            self._ghosts[id(model)] = (model, mujoco.MjData(model), self._ghost_meshes(model))
+            self._ghosts[id(model)] = (model, mujoco.MjData(model), shown)
         _, data, geom_ids = self._ghosts[id(model)]
         mocap = (None if pose is None else to_numpy(pose) for pose in (mocap_pos, mocap_quat))
         pose_ghost(data, to_numpy(qpos), *mocap)
@@ -208,34 +162,17 @@ class ViserDebugVisualizer(DebugVisualizer):
 
     def send(self, offset: np.ndarray) -> None:
         """Show this frame's items, moved by `offset` (3,), and hide what was not drawn again."""
-        self._batch_arrows()
+        arrows, self._arrows = self._arrows, _Arrows()
+        if arrows.starts:
+            shafts, heads = (self._batches.get(key, _Batch()) for key in ("shaft", "head"))
+            arrows.add_to(shafts, heads)
+            if heads.positions:
+                self._batches["shaft"], self._batches["head"] = shafts, heads
         for key, batch in self._batches.items():
             self._send_batch(key, batch, offset)
         for key, handle in self._debug_handles.items():
             if key not in self._batches and handle.visible:
                 handle.visible = False
-
-    def _ghost_meshes(self, model: mujoco.MjModel) -> list[int]:
-        """Make the meshes of the geoms of `model` that a ghost shows; return the geoms' ids."""
-        geom_ids = [
-            geom_id
-            for geom_id in range(model.ngeom)
-            if model.geom_group[geom_id] <= _MAX_GHOST_GEOM_GROUP
-            and _geom_rgba(model, geom_id)[3] > 0
-            and not is_fixed_body(model, int(model.geom_bodyid[geom_id]))
-        ]
-        for geom_id in geom_ids:
-            self._meshes[_ghost_key(model, geom_id)] = merge_geoms(model, [geom_id])
-        return geom_ids
-
-    def _batch_arrows(self) -> None:
-        arrows, self._arrows = self._arrows, _Arrows()
-        if not arrows.starts:
-            return
-        shafts, heads = (self._batches.get(key, _Batch()) for key in ("shaft", "head"))
-        arrows.add_to(shafts, heads)
-        if heads.positions:
-            self._batches["shaft"], self._batches["head"] = shafts, heads
 
     def _add(self, key: str, position, wxyz, scale, color: Color) -> None:
         self._batches.setdefault(key, _Batch()).add(position, wxyz, scale, color)
@@ -273,6 +210,57 @@ class ViserDebugVisualizer(DebugVisualizer):
             handle.visible = True
 
 
+@dataclass
+class _Batch:
+    """Items of one mesh: position, rotation, size, colour and opacity of each."""
+
+    positions: list[np.ndarray] = field(default_factory=list)
+    wxyzs: list[np.ndarray] = field(default_factory=list)
+    scales: list[np.ndarray] = field(default_factory=list)
+    colors: list[Color] = field(default_factory=list)
+
+    def add(self, position, wxyz, scale, color: Color) -> None:
+        self.positions.append(np.array(to_numpy(position), dtype=np.float32))
+        self.wxyzs.append(wxyz)
+        self.scales.append(to_numpy(scale))
+        self.colors.append(color)
+
+    def extend(self, positions, wxyzs, scales, colors: list[Color]) -> None:
+        """Add a row of each array (n, ...) as an item."""
+        self.positions.extend(positions)
+        self.wxyzs.extend(wxyzs)
+        self.scales.extend(scales)
+        self.colors.extend(colors)
+
+
+@dataclass
+class _Arrows:
+    """Arrows of a frame. They are many, so that their directions are computed all at once."""
+
+    starts: list[np.ndarray] = field(default_factory=list)
+    ends: list[np.ndarray] = field(default_factory=list)
+    widths: list[float] = field(default_factory=list)
+    colors: list[Color] = field(default_factory=list)
+
+    def add_to(self, shafts: _Batch, heads: _Batch) -> None:
+        """Add what the arrows that have a direction consist of."""
+        starts = np.array(self.starts, dtype=float).reshape(-1, 3)
+        vectors = np.array(self.ends, dtype=float).reshape(-1, 3) - starts
+        lengths = np.linalg.norm(vectors, axis=1)
+        kept = np.flatnonzero(lengths >= MIN_LENGTH)
+        starts, lengths = starts[kept], lengths[kept, None]
+        axes = vectors[kept] / lengths
+        wxyzs = rotations_of_z(axes)
+        widths = np.array(self.widths, dtype=float)[kept, None]
+        colors = [self.colors[i] for i in kept]
+        shaft, head = (1.0 - _HEAD_FRACTION) * lengths, _HEAD_FRACTION * lengths
+        shafts.extend(
+            starts + 0.5 * shaft * axes, wxyzs, np.hstack((widths, widths, shaft)), colors
+        )
+        radii = _HEAD_WIDENING * widths
+        heads.extend(starts + shaft * axes, wxyzs, np.hstack((radii, radii, head)), colors)
+
+
 def _ghost_key(model: mujoco.MjModel, geom_id: int) -> str:
     return f"ghost/{id(model)}/{geom_id}"
 
@@ -286,17 +274,7 @@ def _wxyz(mat: Array) -> np.ndarray:
     return vtf.SO3.from_matrix(to_numpy(mat).astype(float).reshape(3, 3)).wxyz
 
 
-def _direction(start: np.ndarray, end: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Length of start to end, a rotation (w, x, y, z) that turns z onto it, and its unit vector."""
-    vector = np.asarray(end, dtype=float).reshape(3) - np.asarray(start, dtype=float).reshape(3)
-    length = float(np.linalg.norm(vector))
-    if length < MIN_LENGTH:
-        return length, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
-    axis = vector / length
-    return length, _rotations_of_z(axis[None])[0], axis
-
-
-def _rotations_of_z(axes: np.ndarray) -> np.ndarray:
+def rotations_of_z(axes: np.ndarray) -> np.ndarray:
     """Rotations (n, 4), w first, that turn z onto unit vectors (n, 3)."""
     # Half way between no turn and twice the turn: 1 + z.a, and z x a.
     wxyzs = np.zeros((len(axes), 4))
