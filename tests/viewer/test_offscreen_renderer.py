@@ -51,7 +51,7 @@ def test_wrong_order_of_calls_is_refused_with_what_to_do(monkeypatch) -> None:
 
 @pytest.mark.parametrize(
     ("fields", "message"),
-    [({"max_extra_envs": -1}, "max_extra_envs.*-1"), ({"entity_name": "x"}, "not in the scene")],
+    [({"max_extra_envs": -1}, "max_extra_envs.*-1"), ({"entity_name": "x"}, "entity_name 'x'")],
 )
 def test_bad_configurations_are_refused_before_any_drawing(fields, message) -> None:
     with pytest.raises(ValueError, match=message):
