@@ -240,7 +240,27 @@ def open_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Rend
     try:
         return _open(model, height, width)
     except Exception as error:
-        raise _explained(error, height, width) from error
+        failure = error
+    # Is it the machine, or the size?
+    try:
+        small = _open(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8)
+    except Exception:
+        raise RenderingUnavailableError.offscreen(failure) from failure
+    try:
+        from OpenGL import GL
+
+        limit = int(GL.glGetIntegerv(GL.GL_MAX_RENDERBUFFER_SIZE))
+        most = f" It draws at most {limit} x {limit}, if the memory is enough."
+    except Exception:
+        most = ""
+    finally:
+        small.close()
+    reason = " ".join(str(failure).split())
+    raise RenderingUnavailableError(
+        f"The graphics library of this machine cannot draw an image of {width} x {height} pixels "
+        f"({reason}).{most} Choose a smaller width or height; those of clips are "
+        "--video-width and --video-height."
+    ) from failure
 
 
 def _open(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
@@ -254,29 +274,6 @@ def _open(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
             os.environ["MUJOCO_GL"] = library
             importlib.reload(gl_context)
     return mujoco.Renderer(model, height, width, max_geom=_MAX_GEOMS)
-
-
-def _explained(error: Exception, height: int, width: int) -> RenderingUnavailableError:
-    """Return the error for an image that cannot be drawn: is it the machine, or the size?"""
-    try:
-        small = _open(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8)
-    except Exception:
-        return RenderingUnavailableError.offscreen(error)
-    try:
-        from OpenGL import GL
-
-        limit = int(GL.glGetIntegerv(GL.GL_MAX_RENDERBUFFER_SIZE))
-        most = f" It draws at most {limit} x {limit}, if the memory is enough."
-    except Exception:
-        most = ""
-    finally:
-        small.close()
-    reason = " ".join(str(error).split())
-    return RenderingUnavailableError(
-        f"The graphics library of this machine cannot draw an image of {width} x {height} pixels "
-        f"({reason}).{most} Choose a smaller width or height; those of clips are "
-        "--video-width and --video-height."
-    )
 
 
 class RenderingUnavailableError(MjlabError, RuntimeError):

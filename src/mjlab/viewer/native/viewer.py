@@ -425,11 +425,29 @@ def reward_figures(
     history: TermHistory, viewport: mujoco.MjrRect, cfg: PlotCfg
 ) -> list[tuple[mujoco.MjrRect, mujoco.MjvFigure]]:
     """Return one figure per term and its place, for the first `cfg.max_viewports` terms."""
-    places = compute_viewports(len(history.names), viewport, cfg)
-    return [
-        (place, _figure(name, history.values(name), cfg))
-        for place, name in zip(places, history.names, strict=False)
-    ]
+    figures = []
+    for place, name in zip(
+        compute_viewports(len(history.names), viewport, cfg), history.names, strict=False
+    ):
+        values = history.values(name)
+        exponent, low, high = plot_scale(values, cfg)
+        title = name if exponent == 0 else f"{name} (1e{exponent})"
+        yrange = (low, high)
+        figure = make_empty_figure(title, cfg.grid_size, yrange, cfg.history, cfg.background_alpha)
+        figure.flg_extend = 0
+        figure.linewidth = 2.0
+        figure.range[0][:] = (-cfg.history, 0)
+        figure.linergb[0][:] = (0.3, 0.8, 1.0)
+        # The points are x, y pairs in one row; values that are not finite leave a gap.
+        latest = values[-(figure.linedata.shape[1] // 2) :]
+        steps = np.arange(1 - len(latest), 1)
+        shown = np.isfinite(latest)
+        count = int(shown.sum())
+        figure.linepnt[0] = count
+        figure.linedata[0, 0 : 2 * count : 2] = steps[shown]
+        figure.linedata[0, 1 : 2 * count : 2] = np.clip(latest[shown] / 10.0**exponent, low, high)
+        figures.append((place, figure))
+    return figures
 
 
 def compute_viewports(num_plots: int, rect: mujoco.MjrRect, cfg: PlotCfg) -> list[mujoco.MjrRect]:
@@ -493,22 +511,3 @@ def plot_scale(values: np.ndarray, cfg: PlotCfg) -> tuple[int, float, float]:
     # A flat curve gets a range too, wide enough for the labels of its axis to differ.
     padding = cfg.pad * max(high - low, 0.4 * abs(high), 0.4 * abs(low), cfg.min_span)
     return exponent, float(low - padding), float(high + padding)
-
-
-def _figure(name: str, values: np.ndarray, cfg: PlotCfg) -> mujoco.MjvFigure:
-    exponent, low, high = plot_scale(values, cfg)
-    title = name if exponent == 0 else f"{name} (1e{exponent})"
-    figure = make_empty_figure(title, cfg.grid_size, (low, high), cfg.history, cfg.background_alpha)
-    figure.flg_extend = 0
-    figure.linewidth = 2.0
-    figure.range[0][:] = (-cfg.history, 0)
-    figure.linergb[0][:] = (0.3, 0.8, 1.0)
-    # The points are x, y pairs in one row; values that are not finite leave a gap.
-    latest = values[-(figure.linedata.shape[1] // 2) :]
-    steps = np.arange(1 - len(latest), 1)
-    shown = np.isfinite(latest)
-    count = int(shown.sum())
-    figure.linepnt[0] = count
-    figure.linedata[0, 0 : 2 * count : 2] = steps[shown]
-    figure.linedata[0, 1 : 2 * count : 2] = np.clip(latest[shown] / 10.0**exponent, low, high)
-    return figure

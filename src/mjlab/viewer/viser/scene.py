@@ -202,7 +202,21 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
             self._create_camera_gui()
         if show_debug_viz_control:
             with gui.add_folder("Debug Viz"):
-                self._create_debug_viz_gui()
+                enabled = gui.add_checkbox("Enabled", self.debug_visualization_enabled)
+                all_envs = gui.add_checkbox(
+                    "All envs", self.show_all_envs, visible=self.num_envs > 1
+                )
+
+                @enabled.on_update
+                def _(_: Any) -> None:
+                    self.debug_visualization_enabled = enabled.value
+                    self.request_update()
+
+                @all_envs.on_update
+                def _(_: Any) -> None:
+                    self.show_all_envs = all_envs.value
+                    self.request_update()
+
                 if debug_viz_extra_gui is not None:
                     debug_viz_extra_gui()
 
@@ -338,21 +352,6 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
         def _(_: Any) -> None:
             self.aim()
 
-    def _create_debug_viz_gui(self) -> None:
-        gui = self.server.gui
-        enabled = gui.add_checkbox("Enabled", self.debug_visualization_enabled)
-        all_envs = gui.add_checkbox("All envs", self.show_all_envs, visible=self.num_envs > 1)
-
-        @enabled.on_update
-        def _(_: Any) -> None:
-            self.debug_visualization_enabled = enabled.value
-            self.request_update()
-
-        @all_envs.on_update
-        def _(_: Any) -> None:
-            self.show_all_envs = all_envs.value
-            self.request_update()
-
 
 class GeomVariants:
     """Replaces mjviser's one shape for all environments where randomisation made them differ.
@@ -434,22 +433,19 @@ class GeomVariants:
                     else:
                         model_of_key = model
                     if key not in self._shapes:
-                        self._shapes[key] = self._make_shape(model_of_key, geom_ids, group)
+                        handle = self._scene.server.scene.add_batched_meshes_trimesh(
+                            f"/variants/{len(self._shapes)}",
+                            merge_geoms(model_of_key, geom_ids),
+                            batched_wxyzs=np.array([[1.0, 0.0, 0.0, 0.0]]),
+                            batched_positions=np.zeros((1, 3)),
+                            lod="off",
+                            visible=False,
+                        )
+                        self._shapes[key] = _Shape(handle, group)
                     self._shapes[key].envs.append(env_idx)
                     self._shapes[key].bodies.append(body)
         if borrowed:
             log.warning("More than %d different shapes; the rest are drawn alike.", _MAX_SHAPES)
-
-    def _make_shape(self, model: mujoco.MjModel, geom_ids: list[int], group: int) -> _Shape:
-        handle = self._scene.server.scene.add_batched_meshes_trimesh(
-            f"/variants/{len(self._shapes)}",
-            merge_geoms(model, geom_ids),
-            batched_wxyzs=np.array([[1.0, 0.0, 0.0, 0.0]]),
-            batched_positions=np.zeros((1, 3)),
-            lod="off",
-            visible=False,
-        )
-        return _Shape(handle, group)
 
 
 @dataclass

@@ -420,7 +420,7 @@ class CheckpointPanel:
         latest = gui.add_button("Use Latest", icon=viser.Icon.PLAYER_TRACK_NEXT)
         sync = gui.add_button("Sync", icon=viser.Icon.REFRESH, hint="Look for new checkpoints.")
         self._choice.on_update(self._chosen)
-        latest.on_click(lambda _: self._use_latest())
+        latest.on_click(lambda _: self.load_latest())
         sync.on_click(lambda _: self.refresh())
         self.refresh()
         self.select(manager.current_name)
@@ -466,6 +466,12 @@ class CheckpointPanel:
         """Say what went wrong."""
         self._show(message, color="#e03131")
 
+    def load_latest(self) -> None:
+        """List the source again and load the newest checkpoint."""
+        self.refresh()
+        if self._labels:
+            self._request_load(next(iter(self._labels.values())))
+
     def _show(self, message: str, color: str = "inherit") -> None:
         self._message.content = (
             f'<div style="padding:0 1em;font-size:0.85em;color:{color}">'
@@ -483,11 +489,6 @@ class CheckpointPanel:
         name = self._labels.get(self._choice.value)
         if name is not None and not getattr(self._silent, "on", False):
             self._request_load(name)
-
-    def _use_latest(self) -> None:
-        self.refresh()
-        if self._labels:
-            self._request_load(next(iter(self._labels.values())))
 
 
 def local_checkpoints(

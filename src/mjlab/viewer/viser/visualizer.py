@@ -40,7 +40,7 @@ class ViserDebugVisualizer(DebugVisualizer):
         self._batches: dict[str, _Batch] = {}
         self._arrows = _Arrows()
         self._debug_handles: dict[str, viser.BatchedMeshHandle] = {}
-        self._ghosts: dict[int, tuple[mujoco.MjModel, mujoco.MjData, list[int]]] = {}
+        self._ghosts: dict[int, tuple[mujoco.MjModel, mujoco.MjData, dict[int, str]]] = {}
 
     @property
     def meansize(self) -> float:
@@ -121,26 +121,26 @@ class ViserDebugVisualizer(DebugVisualizer):
         label: str | None = None,
     ) -> None:
         if id(model) not in self._ghosts:
-            shown = [
-                geom_id
+            shown = {
+                geom_id: f"ghost/{id(model)}/{geom_id}"
                 for geom_id in range(model.ngeom)
                 if model.geom_group[geom_id] <= _MAX_GHOST_GEOM_GROUP
                 and _geom_rgba(model, geom_id)[3] > 0
                 and not is_fixed_body(model, int(model.geom_bodyid[geom_id]))
-            ]
-            for geom_id in shown:
-                self._meshes[_ghost_key(model, geom_id)] = merge_geoms(model, [geom_id])
+            }
+            for geom_id, key in shown.items():
+                self._meshes[key] = merge_geoms(model, [geom_id])
             # The model is kept too, so that its id cannot be reused by another model.
             self._ghosts[id(model)] = (model, mujoco.MjData(model), shown)
-        _, data, geom_ids = self._ghosts[id(model)]
+        _, data, shown = self._ghosts[id(model)]
         mocap = (None if pose is None else to_numpy(pose) for pose in (mocap_pos, mocap_quat))
         pose_ghost(data, to_numpy(qpos), *mocap)
         compute_poses(model, data)
-        for geom_id in geom_ids:
+        for geom_id, key in shown.items():
             body_id = model.geom_bodyid[geom_id]
             red, green, blue, _ = _geom_rgba(model, geom_id)
             self._add(
-                _ghost_key(model, geom_id),
+                key,
                 data.xpos[body_id],
                 data.xquat[body_id],
                 (1.0, 1.0, 1.0),
@@ -259,10 +259,6 @@ class _Arrows:
         )
         radii = _HEAD_WIDENING * widths
         heads.extend(starts + shaft * axes, wxyzs, np.hstack((radii, radii, head)), colors)
-
-
-def _ghost_key(model: mujoco.MjModel, geom_id: int) -> str:
-    return f"ghost/{id(model)}/{geom_id}"
 
 
 def _geom_rgba(model: mujoco.MjModel, geom_id: int) -> np.ndarray:
