@@ -12,12 +12,13 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
-from viewer_fakes import FakeEnv, push
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.utils.wrappers import VideoRecorder
 from mjlab.utils.wrappers.video_recorder import ClipWriter
 from mjlab.viewer import RenderingUnavailableError
+
+from ...viewer.viewer_fakes import FakeEnv, push  # noqa: TID252
 
 ACTION = torch.zeros(1, 1)
 
