@@ -111,14 +111,20 @@ def test_the_scenes_own_model_is_left_alone() -> None:
 
 
 @pytest.mark.usefixtures("gl")
-def test_it_renders_without_a_display_although_mujoco_was_imported_before_mjlab() -> None:
+@pytest.mark.parametrize("chosen_first", [None, "disable"])
+def test_it_renders_without_a_display_although_mujoco_was_imported_before_mjlab(
+    chosen_first,
+) -> None:
     code = (
-        "import mujoco\n"
+        "import os, mujoco\n"
+        "os.environ.pop('MUJOCO_GL', None)\n"
         "from mjlab.viewer.offscreen_renderer import open_renderer\n"
         "open_renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).close()"
     )
     without = ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")
     environ = {name: value for name, value in os.environ.items() if name not in without}
+    if chosen_first is not None:
+        environ["MUJOCO_GL"] = chosen_first
     subprocess.run([sys.executable, "-c", code], check=True, env=environ)
 
 
