@@ -26,6 +26,8 @@ from typing import Any
 
 import numpy as np
 
+from mjlab.utils.os import replacing
+
 _ARRAYS: dict[str, int | None] = {
     "joint_pos": None,
     "joint_vel": None,
@@ -133,18 +135,13 @@ def write_motion(path: str | Path, motion: Motion) -> Path:
         if (names := getattr(motion, key))
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            for key, array in entries.items():
-                buffer = io.BytesIO()
-                np.lib.format.write_array(buffer, array, allow_pickle=False)
-                # A fixed date, because `np.savez` would write that of today.
-                info = zipfile.ZipInfo(f"{key}.npy")
-                archive.writestr(info, buffer.getvalue(), zipfile.ZIP_DEFLATED, 9)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for key, array in entries.items():
+            buffer = io.BytesIO()
+            np.lib.format.write_array(buffer, array, allow_pickle=False)
+            # A fixed date, because `np.savez` would write that of today.
+            info = zipfile.ZipInfo(f"{key}.npy")
+            archive.writestr(info, buffer.getvalue(), zipfile.ZIP_DEFLATED, 9)
     return path
 
 
