@@ -1,4 +1,4 @@
-"""Turn joint angles into a motion: `python -m mjlab.scripts.csv_to_npz --input-file FILE`."""
+"""Turn joint angles into a motion: `mjlab csv-to-npz --input-file FILE`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Look at terrains in the browser: `python -m mjlab.scripts.visualize_terrain pyramid_stairs`."""
+"""Look at terrains in the browser: `mjlab visualize-terrain pyramid_stairs`."""
 
 from __future__ import annotations
 

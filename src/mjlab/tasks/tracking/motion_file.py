@@ -88,8 +88,8 @@ def read_motion(path: str | Path) -> Motion:
     missing = [key for key in _ARRAYS if key not in content]
     if missing:
         raise MotionFileError(
-            f"The motion {path} lacks {missing}; it has {sorted(content)}. `python -m "
-            "mjlab.scripts.csv_to_npz` makes a motion from joint angles."
+            f"The motion {path} lacks {missing}; it has {sorted(content)}. "
+            "`mjlab csv-to-npz` makes a motion from joint angles."
         )
     arrays = {key: _checked_array(path, key, content[key], size) for key, size in _ARRAYS.items()}
     _check_sizes(path, arrays)
@@ -186,7 +186,7 @@ def check_motion_fits(
         raise MotionFileError(
             f"The motion {path} has {motion.fps:g} frames per second, and the task is controlled "
             f"{1.0 / step_dt:g} times per second (every {step_dt:g} s), so that it would play at "
-            "the wrong speed. Resample it: `python -m mjlab.scripts.csv_to_npz --input-file "
+            "the wrong speed. Resample it: `mjlab csv-to-npz --input-file "
             f"{path} --output-fps {1.0 / step_dt:g} --output-file ...`."
         )
 
