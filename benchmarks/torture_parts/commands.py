@@ -36,7 +36,7 @@ _OUTPUT = 100_000
 _KEPT = 1 << 20
 # What commands import late; forked processes should have it.
 _IMPORTS = (
-    "mjlab.envs", "mjlab.rl", "mjlab.rl.evaluation", "mjlab.rl.onnx_policy", "mjlab.rl.plot",
+    "mjlab.envs", "mjlab.rl", "mjlab.rl.evaluation", "mjlab.rl.exporter_utils", "mjlab.rl.plot",
     "mjlab.rl.run_logger", "mjlab.rl.sac", "mjlab.scripts.demo", "mjlab.scripts.display",
     "mjlab.scripts.evaluate_run", "mjlab.scripts.export_scene_run", "mjlab.scripts.play_run",
     "mjlab.scripts.profile_env_run", "mjlab.scripts.resume", "mjlab.scripts.train_run",
