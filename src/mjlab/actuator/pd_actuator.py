@@ -10,7 +10,7 @@ import torch
 
 from mjlab.actuator.actuator import Actuator, ActuatorCfg, ActuatorCmd
 from mjlab.sim.simulation import SharedField
-from mjlab.utils.indexing import EnvIds, as_rows
+from mjlab.utils.indexing import EnvIds, as_ids
 from mjlab.utils.spec import create_motor_actuator
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
         """
         for parameter, value, what in ((self.stiffness, kp, "kp"), (self.damping, kd, "kd")):
             if value is not None:
-                rows = as_rows(env_ids, *_rows_of(parameter))
+                rows = as_ids(env_ids, len(parameter), parameter.device)
                 parameter[rows] = _per_target(value, (len(rows), parameter.shape[1]), what)
 
     def set_effort_limit(self, env_ids: EnvIds, effort_limit: torch.Tensor) -> None:
@@ -171,7 +171,7 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
         Raises:
             ValueError: a tensor of another shape.
         """
-        rows = as_rows(env_ids, *_rows_of(self.force_limit))
+        rows = as_ids(env_ids, len(self.force_limit), self.force_limit.device)
         shape = (len(rows), self.force_limit.shape[1])
         limit = _per_target(effort_limit, shape, "effort_limit")
         self.force_limit[rows] = limit
@@ -184,10 +184,6 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
             if not isinstance(values, SharedField):
                 ranges = torch.stack((-limit, limit), dim=-1).to(values.dtype)
                 values[rows[:, None], columns] = ranges
-
-
-def _rows_of(parameter: torch.Tensor) -> tuple[int, torch.device]:
-    return parameter.shape[0], parameter.device
 
 
 def _per_target(value: torch.Tensor, shape: tuple[int, int], what: str) -> torch.Tensor:

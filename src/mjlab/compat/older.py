@@ -25,7 +25,7 @@ from mjlab.envs.mdp.dr._table import TABLE
 from mjlab.envs.mdp.dr.actuator import selected_actuators
 from mjlab.managers.event_manager import derived_fields
 from mjlab.sim.randomization import RecomputeLevel
-from mjlab.utils.indexing import resolve_env_ids
+from mjlab.utils.indexing import as_ids
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -176,7 +176,7 @@ def sync_actuator_delays(
     low, high = int(lag_range[0]), int(lag_range[1])
     if not 0 <= low <= high:
         raise ValueError(f"lag_range must be 0 <= smallest <= largest, got {tuple(lag_range)}.")
-    rows = resolve_env_ids(env, env_ids)
+    rows = as_ids(env_ids, env.num_envs, env.device)
     lags = torch.randint(low, high + 1, (len(rows),), device=env.device)
     for selected in selected_actuators(env, rows, asset_cfg):
         if selected.actuator.has_delay:

@@ -24,7 +24,7 @@ from mjlab.managers.term_checks import checked_when_built, require_command
 from mjlab.tasks.velocity.mdp import rewards as feet_rewards
 from mjlab.tasks.velocity.mdp.observations import Source, site_columns
 from mjlab.tasks.velocity.mdp.rewards import if_commanded
-from mjlab.utils.indexing import as_ids, columns
+from mjlab.utils.indexing import as_columns, as_ids
 from mjlab.utils.state import capture_state, restore_state
 
 if TYPE_CHECKING:
@@ -103,9 +103,6 @@ def _other_envs_kept(term: Any, env_ids: Any) -> Generator[None]:
     such as step counters and running means, is put back whole: a reset takes no time. Generators
     go on, so that the next draw is another one.
     """
-    if isinstance(env_ids, list):
-        # An empty list alone would become a tensor of floats.
-        env_ids = torch.as_tensor(env_ids or torch.empty(0, dtype=torch.long), device=term.device)
     if env_ids is not None:
         env_ids = as_ids(env_ids, term.num_envs, term.device)
     if env_ids is None or len(env_ids) == term.num_envs:
@@ -178,7 +175,7 @@ def _check_sites(
 @checked_when_built(_check_sites)
 def foot_height(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:
     """Height of each selected site above z = 0 (m), (N, sites)."""
-    sites = columns(asset_cfg.site_ids, env.device)
+    sites = as_columns(asset_cfg.site_ids, env.device)
     return env.scene[asset_cfg.name].data.site_pos_w[:, sites, 2]
 
 

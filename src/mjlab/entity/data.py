@@ -11,6 +11,7 @@ import torch
 
 from mjlab.compat import offers_older_attributes, older_names
 from mjlab.entity.indexing import Addresses, EntityIndexing, Ids
+from mjlab.utils.indexing import EnvIds, as_ids
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse, quat_from_matrix, quat_mul
 from mjlab.utils.state import stateful
 
@@ -387,8 +388,6 @@ class KinematicsReader:
 
 # MERGED mjlab.entity.data: Writing the state of one entity into the simulation.
 
-EnvIds = torch.Tensor | slice | None
-
 
 def assign(
     field: torch.Tensor,
@@ -400,7 +399,7 @@ def assign(
     if env_ids is None:
         field[:, columns] = value
     elif isinstance(columns, torch.Tensor) and not isinstance(env_ids, slice):
-        field[_row_numbers(env_ids)[:, None], columns] = value
+        field[as_ids(env_ids, len(field), field.device)[:, None], columns] = value
     else:
         field[env_ids, columns] = value
 
@@ -432,11 +431,6 @@ def as_values(
             f"but {width} are to be written. Give a tensor of shape (number of envs, {width})."
         )
     return value
-
-
-def _row_numbers(env_ids: torch.Tensor) -> torch.Tensor:
-    env_ids = torch.as_tensor(env_ids)
-    return env_ids.nonzero().flatten() if env_ids.dtype == torch.bool else env_ids
 
 
 class StateWriter:

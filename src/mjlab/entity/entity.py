@@ -28,10 +28,11 @@ from mjlab.entity.building import (
     take_keys,
     take_options,
 )
-from mjlab.entity.data import EntityData, EnvIds, as_values, assign
+from mjlab.entity.data import EntityData, as_values, assign
 from mjlab.entity.indexing import EntityIndexing as EntityIndexing
 from mjlab.entity.indexing import Ids, build_indexing
 from mjlab.utils import spec_config as spec_cfg
+from mjlab.utils.indexing import EnvIds, as_ids
 from mjlab.utils.lab_api.string import resolve_matching_names
 from mjlab.utils.spec import auto_wrap_fixed_base_mocap, compile_composed
 from mjlab.utils.state import stateful
@@ -458,9 +459,7 @@ def _set_target(
     elif isinstance(ids, slice):
         columns, width = ids, len(range(*ids.indices(width)))
     else:
-        columns = torch.as_tensor(ids, device=target.device)
-        if columns.dtype == torch.bool:
-            columns = columns.nonzero().flatten()
+        columns = as_ids(ids, width, target.device)
         width = columns.shape[0]
     values = as_values(value, width, f"The {what} target", str(target.device), broadcasts=True)
     assign(target, values, env_ids, columns)

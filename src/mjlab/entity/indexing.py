@@ -10,6 +10,7 @@ from typing import Any, TypeAlias, TypeVar
 import mujoco
 import torch
 
+from mjlab.utils.indexing import as_columns
 from mjlab.utils.mujoco import (
     control_columns,
     dof_width,
@@ -36,7 +37,7 @@ class Addresses:
         self._host = [int(position) for position in host]
         self._device = device
         self.tensor = torch.tensor(self._host, dtype=torch.int64, device=device)
-        self.all: slice | torch.Tensor = self._shortest(self._host)
+        self.all: slice | torch.Tensor = as_columns(self._host, device)
         self.constant = self._host[0] if len(set(self._host)) == 1 else None
 
     def __len__(self) -> int:
@@ -50,14 +51,7 @@ class Addresses:
             chosen = self.tensor[ids]
             return chosen, chosen.shape[0]
         host = self._host[ids] if isinstance(ids, slice) else [self._host[int(i)] for i in ids]
-        return self._shortest(host), len(host)
-
-    def _shortest(self, host: list[int]) -> slice | torch.Tensor:
-        if not host:
-            return slice(0, 0)
-        if host == list(range(host[0], host[0] + len(host))):
-            return slice(host[0], host[0] + len(host))
-        return torch.tensor(host, dtype=torch.int64, device=self._device)
+        return as_columns(host, self._device), len(host)
 
 
 @dataclass(eq=False)

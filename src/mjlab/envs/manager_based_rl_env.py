@@ -52,6 +52,7 @@ from mjlab.sim.engine import resolve_engine_name
 from mjlab.sim.memory import LEAST_BYTES, check_memory
 from mjlab.sim.simulation import Simulation
 from mjlab.utils import spaces
+from mjlab.utils.indexing import as_ids
 from mjlab.utils.random import draw_seed, seed_rng
 from mjlab.viewer.viewer_config import ViewerConfig
 
@@ -205,7 +206,7 @@ def as_reset_ids(env_ids: Any, num_envs: int, device: str) -> torch.Tensor:
         ValueError: a mask of another length, indices that are no integers or out of range.
     """
     if env_ids is None or isinstance(env_ids, slice):
-        return torch.arange(num_envs, device=device)[env_ids or slice(None)]
+        return as_ids(env_ids, num_envs, device)
     expected = (
         f"env_ids must be integers from 0 to {num_envs - 1}, a bool mask of length {num_envs}, a "
         "slice, or None for all environments"

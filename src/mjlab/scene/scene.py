@@ -27,6 +27,7 @@ from mjlab.sensor import (
 from mjlab.sim.config import MujocoCfg
 from mjlab.sim.engine import Stage
 from mjlab.terrains.terrain_entity import TerrainEntity, TerrainEntityCfg
+from mjlab.utils.indexing import EnvIds
 from mjlab.utils.mujoco import OPTION_ENUMS, flag_names
 from mjlab.utils.spec import attach, compile_composed, export_spec, make_asset_paths_absolute
 from mjlab.utils.state import stateful
@@ -234,7 +235,6 @@ def _same(first: Any, second: Any) -> bool:
     return bool(np.array_equal(np.asarray(first), np.asarray(second)))
 
 
-EnvIds = torch.Tensor | slice | None
 TERRAIN = "terrain"
 
 

@@ -30,13 +30,12 @@ from mjlab.sim.memory import bytes_per_environment, check_memory
 from mjlab.sim.randomization import RecomputeLevel, VariantInfo, VariantValues, is_structure
 from mjlab.sim.sim_data import FieldView
 from mjlab.sim.warning_log import collect_mujoco_warnings
+from mjlab.utils.indexing import EnvIds, as_ids
 from mjlab.utils.mujoco import moving_dofs
 from mjlab.utils.nan_guard import NanGuard
 from mjlab.utils.spec import compile_spec
 
 logger = logging.getLogger(__name__)
-
-EnvIds = torch.Tensor | slice | None
 
 # Shapes of rows that MuJoCo stores flat, as MuJoCo Warp has them.
 _ROW_SHAPES = {"cam_mat0": (3, 3), "geom_aabb": (2, 3)}
@@ -557,11 +556,9 @@ class Simulation:
         """Return `env_ids` as the engine takes them: None, or int64, on a CPU sorted and unique."""
         if env_ids is None or (isinstance(env_ids, slice) and env_ids == slice(None)):
             return None
-        if isinstance(env_ids, slice) or env_ids.dtype == torch.bool:
-            env_ids = torch.arange(self.num_envs, device=self.device)[env_ids]
-        env_ids = env_ids.to(self.device, torch.int64)
+        ids = as_ids(env_ids, self.num_envs, self.device)
         # To sort them, the host would have to wait for a GPU.
-        return env_ids if env_ids.is_cuda or len(env_ids) < 2 else env_ids.unique()
+        return ids if ids.is_cuda or len(ids) < 2 else ids.unique()
 
 
 def _reshape_rows(field: str, tensor: torch.Tensor) -> torch.Tensor:

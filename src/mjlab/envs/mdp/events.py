@@ -15,8 +15,7 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.utils.indexing import columns, num_selected
-from mjlab.utils.indexing import resolve_env_ids as resolve_env_ids
+from mjlab.utils.indexing import as_columns, as_ids, num_selected
 from mjlab.utils.lab_api.math import (
     quat_apply,
     quat_apply_inverse,
@@ -80,7 +79,7 @@ class apply_body_impulse:
         self._env = env
         self._asset_cfg: SceneEntityCfg = params["asset_cfg"]
         self._asset: Entity = env.scene[self._asset_cfg.name]
-        self._bodies = columns(self._asset_cfg.body_ids, env.device)
+        self._bodies = as_columns(self._asset_cfg.body_ids, env.device)
         self._num_bodies = num_selected(self._asset_cfg.body_ids, self._asset.num_bodies)
         self._cooldown_s = tuple(params["cooldown_s"])
         self._offset = params.get("body_point_offset")
@@ -291,7 +290,7 @@ def reset_joints_by_offset(
     """
     ids = resolve_env_ids(env, env_ids)
     asset: Entity = env.scene[asset_cfg.name]
-    data, joints = asset.data, columns(asset_cfg.joint_ids, env.device)
+    data, joints = asset.data, as_columns(asset_cfg.joint_ids, env.device)
     position = data.default_joint_pos[ids][:, joints]
     position += sample_uniform(*position_range, position.shape, env.device)
     limits = data.soft_joint_pos_limits[ids][:, joints]
@@ -347,7 +346,7 @@ def apply_external_force_torque(
     forces = sample_uniform(*force_range, shape, env.device)
     torques = sample_uniform(*torque_range, shape, env.device)
     asset.write_external_wrench_to_sim(
-        forces, torques, env_ids=ids, body_ids=columns(asset_cfg.body_ids, env.device)
+        forces, torques, env_ids=ids, body_ids=as_columns(asset_cfg.body_ids, env.device)
     )
 
 
@@ -392,3 +391,12 @@ def _write_root(
     # The pose comes first: writing the velocity rotates its angular part into the body's frame.
     asset.write_root_link_pose_to_sim(root_pose, env_ids=ids)
     asset.write_root_link_velocity_to_sim(velocity, env_ids=ids)
+
+
+def resolve_env_ids(env: ManagerBasedRlEnv, env_ids: torch.Tensor | slice | None) -> torch.Tensor:
+    """Return environment ids as an int64 tensor.
+
+    Args:
+        env_ids: None (all environments), int ids, a bool mask or a slice.
+    """
+    return as_ids(env_ids, env.num_envs, env.device)

@@ -13,7 +13,7 @@ import torch
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.sensor.builtin_sensor import BuiltinSensor
-from mjlab.utils.indexing import columns
+from mjlab.utils.indexing import as_columns
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -57,7 +57,7 @@ def joint_pos_rel(
         biased: Add the encoder bias, as a robot's own encoders would.
     """
     asset: Entity = env.scene[asset_cfg.name]
-    data, joints = asset.data, columns(asset_cfg.joint_ids, env.device)
+    data, joints = asset.data, as_columns(asset_cfg.joint_ids, env.device)
     relative = data.joint_pos[:, joints] - data.default_joint_pos[:, joints]
     if biased:
         relative += data.encoder_bias[:, joints]
@@ -69,7 +69,7 @@ def joint_vel_rel(
 ) -> torch.Tensor:
     """Joint velocities minus default velocities (rad/s or m/s), (N, joints)."""
     asset: Entity = env.scene[asset_cfg.name]
-    joints = columns(asset_cfg.joint_ids, env.device)
+    joints = as_columns(asset_cfg.joint_ids, env.device)
     return asset.data.joint_vel[:, joints] - asset.data.default_joint_vel[:, joints]
 
 

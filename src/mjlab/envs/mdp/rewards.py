@@ -8,7 +8,7 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.utils.indexing import columns
+from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.string import resolve_matching_names_values
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def joint_torques_l2(
     """Sum of squared actuator forces, before their gear, over the selected **actuators**."""
     asset: Entity = env.scene[asset_cfg.name]
     chosen = asset.data.indexing.force_columns(asset_cfg.actuator_ids)
-    forces = asset.data.actuator_force[:, columns(chosen, env.device)]
+    forces = asset.data.actuator_force[:, as_columns(chosen, env.device)]
     return forces.square().sum(dim=1)
 
 
@@ -44,7 +44,7 @@ def joint_vel_l2(
 ) -> torch.Tensor:
     """Sum of squared joint velocities."""
     asset: Entity = env.scene[asset_cfg.name]
-    velocities = asset.data.joint_vel[:, columns(asset_cfg.joint_ids, env.device)]
+    velocities = asset.data.joint_vel[:, as_columns(asset_cfg.joint_ids, env.device)]
     return velocities.square().sum(dim=1)
 
 
@@ -53,7 +53,7 @@ def joint_acc_l2(
 ) -> torch.Tensor:
     """Sum of squared joint accelerations."""
     asset: Entity = env.scene[asset_cfg.name]
-    accelerations = asset.data.joint_acc[:, columns(asset_cfg.joint_ids, env.device)]
+    accelerations = asset.data.joint_acc[:, as_columns(asset_cfg.joint_ids, env.device)]
     return accelerations.square().sum(dim=1)
 
 
@@ -78,7 +78,7 @@ def joint_pos_limits(
 ) -> torch.Tensor:
     """Sum of the distances by which joints are beyond their soft limits (rad or m)."""
     asset: Entity = env.scene[asset_cfg.name]
-    joints = columns(asset_cfg.joint_ids, env.device)
+    joints = as_columns(asset_cfg.joint_ids, env.device)
     position = asset.data.joint_pos[:, joints]
     limits = asset.data.soft_joint_pos_limits[:, joints]
     below = (limits[..., 0] - position).clamp_(min=0.0)
@@ -128,7 +128,7 @@ class posture:
         self, env: ManagerBasedRlEnv, std: object, asset_cfg: SceneEntityCfg
     ) -> torch.Tensor:
         asset: Entity = env.scene[asset_cfg.name]
-        joints = columns(asset_cfg.joint_ids, env.device)
+        joints = as_columns(asset_cfg.joint_ids, env.device)
         error = asset.data.joint_pos[:, joints] - asset.data.default_joint_pos[:, joints]
         return torch.exp(-(error / self.std).square().mean(dim=1))
 
@@ -141,7 +141,7 @@ class electrical_power_cost:
 
     def __call__(self, env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
         asset: Entity = env.scene[asset_cfg.name]
-        joints = columns(asset_cfg.joint_ids, env.device)
+        joints = as_columns(asset_cfg.joint_ids, env.device)
         power = asset.data.qfrc_actuator[:, joints] * asset.data.joint_vel[:, joints]
         return power.clamp_(min=0.0).sum(dim=1)
 

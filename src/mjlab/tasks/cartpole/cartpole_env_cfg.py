@@ -40,7 +40,7 @@ from mjlab.rl.config import (
 from mjlab.scene import SceneCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
 from mjlab.terrains import TerrainEntityCfg
-from mjlab.utils.indexing import columns
+from mjlab.utils.indexing import as_columns
 from mjlab.viewer import ViewerConfig
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def pole_angle_cos_sin(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _HING
     The angle of a hinge without limits grows with every turn; these repeat.
     """
     asset: Entity = env.scene[asset_cfg.name]
-    angle = asset.data.joint_pos[:, columns(asset_cfg.joint_ids, env.device)]
+    angle = asset.data.joint_pos[:, as_columns(asset_cfg.joint_ids, env.device)]
     return torch.cat([torch.cos(angle), torch.sin(angle)], dim=-1)
 
 
@@ -126,8 +126,8 @@ def cartpole_smooth_reward(
     the pole is upright, the cart centred, the control small and the pole still, all at once.
     """
     asset: Entity = env.scene[cart_cfg.name]
-    slider = columns(cart_cfg.joint_ids, env.device)
-    hinge = columns(hinge_cfg.joint_ids, env.device)
+    slider = as_columns(cart_cfg.joint_ids, env.device)
+    hinge = as_columns(hinge_cfg.joint_ids, env.device)
     cart_pos = asset.data.joint_pos[:, slider].squeeze(-1)
     control = asset.data.joint_effort_target[:, slider].squeeze(-1)
     pole_angle = asset.data.joint_pos[:, hinge].squeeze(-1)

@@ -18,7 +18,7 @@ from mjlab.tasks.velocity.mdp.observations import (
     contact_columns,
     height_columns,
 )
-from mjlab.utils.indexing import columns
+from mjlab.utils.indexing import as_columns
 from mjlab.utils.torch import constant_tensor
 
 _ROBOT = "robot"
@@ -90,7 +90,7 @@ def foot_slip(env: Any) -> torch.Tensor:
     in_contact = env.scene[_CONTACTS].data.found > 0
     robot = env.scene[_ROBOT]
     names = [ref.name for ref in (frame if isinstance(frame, tuple) else (frame,))]
-    sites = columns([robot.site_names.index(name) for name in names], env.device)
+    sites = as_columns([robot.site_names.index(name) for name in names], env.device)
     speed = robot.data.site_lin_vel_w[:, sites, :2].norm(dim=-1)
     return (speed * in_contact).sum(dim=1) / in_contact.sum(dim=1).clamp(min=1)
 

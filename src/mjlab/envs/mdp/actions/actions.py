@@ -10,7 +10,7 @@ import torch
 
 from mjlab.actuator.actuator import TransmissionType, constant_within_step
 from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
-from mjlab.utils.indexing import columns
+from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.string import resolve_matching_names, resolve_matching_names_values
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class BaseAction(ActionTerm):
         ids, self._target_names = self._find_targets()
         self._target_ids = torch.tensor(ids, dtype=torch.long, device=self.device)
         # The same targets as a slice where they are contiguous, which reads without a copy.
-        self._columns = columns(ids, self.device)
+        self._columns = as_columns(ids, self.device)
         self._raw_actions = torch.zeros(
             self.num_envs, len(ids), dtype=torch.float32, device=self.device
         )

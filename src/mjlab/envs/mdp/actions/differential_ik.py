@@ -11,7 +11,7 @@ import torch
 
 from mjlab.compat import accepts_older_fields, offers_older_attributes, older_names
 from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
-from mjlab.utils.indexing import columns
+from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import compute_pose_error, normalize, quat_box_plus, quat_from_matrix
 from mjlab.utils.string import resolve_expr
 
@@ -152,10 +152,10 @@ class DifferentialIKAction(ActionTerm):
         if cfg.clip is not None:
             logger.warning("DifferentialIKActionCfg.clip has no effect; max_dq bounds the motion.")
         ids, self._joint_names = self._entity.find_joints_by_actuator_names(cfg.actuator_names)
-        self._columns = columns(ids, self.device)
+        self._columns = as_columns(ids, self.device)
         joints = self._entity.indexing.joint_ids[ids].tolist()
         dofs = env.sim.mj_model.jnt_dofadr[joints].tolist()
-        self._dofs = columns(dofs, self.device)
+        self._dofs = as_columns(dofs, self.device)
         self._find_frame()
         self._posture = self._find_posture()
         self._raw_actions = torch.zeros(

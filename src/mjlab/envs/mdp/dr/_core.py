@@ -22,7 +22,7 @@ from mjlab.envs.mdp.dr._types import (
 )
 from mjlab.managers.event_manager import RecomputeLevel, requires_model_fields
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.utils.indexing import resolve_env_ids
+from mjlab.utils.indexing import as_ids
 from mjlab.utils.lab_api.math import quat_from_euler_xyz, quat_mul
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ def select(
     ids = torch.tensor(local_ids, dtype=torch.long, device=env.device)
     global_ids = all_ids[ids].long()
     columns = global_ids if kind.start is None else _addresses(env, kind, global_ids)
-    return Selection(env, entity, kind, resolve_env_ids(env, env_ids), ids, columns)
+    return Selection(env, entity, kind, as_ids(env_ids, env.num_envs, env.device), ids, columns)
 
 
 def _local_ids(ids: slice | int | Sequence[int] | torch.Tensor, count: int) -> list[int]:

@@ -37,7 +37,7 @@ from mjlab.envs.mdp.dr._types import (
     resolve_operation,
 )
 from mjlab.managers.event_manager import requires_model_fields
-from mjlab.utils.indexing import columns, resolve_env_ids
+from mjlab.utils.indexing import as_columns, as_ids
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -81,7 +81,7 @@ def selected_actuators(
     `asset_cfg.actuator_ids` counts single actuators, as `actuator_names` does.
     """
     entity: Entity = env.scene[asset_cfg.name]
-    chosen = entity.data.indexing.actuator_ids[columns(asset_cfg.actuator_ids, env.device)]
+    chosen = entity.data.indexing.actuator_ids[as_columns(asset_cfg.actuator_ids, env.device)]
     for actuator in entity.actuators:
         ids, count = actuator.global_element_ids, len(actuator.target_names)
         # Kinds of a user's own may have another layout; who needs single elements refuses them.
@@ -179,7 +179,7 @@ def pd_gains(
     """
     dist, op = resolve_distribution(distribution), _scale_or_abs(operation, "pd_gains")
     bounds = read_bounds(kp_range, "kp_range"), read_bounds(kd_range, "kd_range")
-    chosen = list(selected_actuators(env, resolve_env_ids(env, env_ids), asset_cfg))
+    chosen = list(selected_actuators(env, as_ids(env_ids, env.num_envs, env.device), asset_cfg))
     places = [_gain_places(env, selected) for selected in chosen]
     for selected, gains in zip(chosen, places, strict=True):
         kp, kd = (selected.draw(dist, pair, env.device) for pair in bounds)
@@ -226,7 +226,7 @@ def effort_limits(
     """
     dist, op = resolve_distribution(distribution), _scale_or_abs(operation, "effort_limits")
     bounds = read_bounds(effort_limit_range, "effort_limit_range")
-    chosen = list(selected_actuators(env, resolve_env_ids(env, env_ids), asset_cfg))
+    chosen = list(selected_actuators(env, as_ids(env_ids, env.num_envs, env.device), asset_cfg))
     places = [_limit_places(env, selected) for selected in chosen]
     for selected, (controls, targets) in zip(chosen, places, strict=True):
         samples = selected.draw(dist, bounds, env.device)

@@ -20,7 +20,7 @@ from mjlab.tasks.manipulation.mdp.commands import (
     MultiCubeLiftingCommand,
     check_reach,
 )
-from mjlab.utils.indexing import columns
+from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import quat_apply_inverse
 
 if TYPE_CHECKING:
@@ -67,13 +67,13 @@ def _command(env: ManagerBasedRlEnv, name: str, kind: Any) -> Any:
 def site_pos(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
     """Return the position of the one selected site in the world, (N, 3)."""
     asset: Entity = env.scene[asset_cfg.name]
-    return asset.data.site_pos_w[:, columns(asset_cfg.site_ids, env.device)].squeeze(1)
+    return asset.data.site_pos_w[:, as_columns(asset_cfg.site_ids, env.device)].squeeze(1)
 
 
 def site_quat(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
     """Return the orientation of the one selected site in the world, (N, 4)."""
     asset: Entity = env.scene[asset_cfg.name]
-    return asset.data.site_quat_w[:, columns(asset_cfg.site_ids, env.device)].squeeze(1)
+    return asset.data.site_quat_w[:, as_columns(asset_cfg.site_ids, env.device)].squeeze(1)
 
 
 # Checks, made when a manager is built.
@@ -335,7 +335,7 @@ def ee_velocity(
 ) -> torch.Tensor:
     """Linear velocity of the end effector in its own frame (m/s), (N, 3)."""
     asset: Entity = env.scene[asset_cfg.name]
-    sites = columns(asset_cfg.site_ids, env.device)
+    sites = as_columns(asset_cfg.site_ids, env.device)
     velocity = asset.data.site_lin_vel_w[:, sites].squeeze(1)
     return quat_apply_inverse(site_quat(env, asset_cfg), velocity)
 

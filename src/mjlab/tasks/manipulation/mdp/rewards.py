@@ -22,7 +22,7 @@ from mjlab.tasks.manipulation.mdp.observations import (
     multi_cube_command,
     site_pos,
 )
-from mjlab.utils.indexing import columns
+from mjlab.utils.indexing import as_columns
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -100,7 +100,7 @@ def joint_velocity_hinge_penalty(
     has to be negative.
     """
     asset: Entity = env.scene[asset_cfg.name]
-    speed = asset.data.joint_vel[:, columns(asset_cfg.joint_ids, env.device)].abs()
+    speed = asset.data.joint_vel[:, as_columns(asset_cfg.joint_ids, env.device)].abs()
     return speed.sub_(max_vel).clamp_(min=0.0).square_().sum(dim=1)
 
 

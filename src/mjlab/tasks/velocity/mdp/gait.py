@@ -19,7 +19,7 @@ from mjlab.managers.term_checks import checked_when_built, nearest, require_comm
 from mjlab.sensor import TerrainHeightSensor
 from mjlab.tasks.velocity.mdp.observations import check_height_sensor
 from mjlab.tasks.velocity.mdp.rewards import command_speed, values_of_joints
-from mjlab.utils.indexing import columns
+from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import quat_apply_inverse
 from mjlab.utils.torch import constant_tensor
 
@@ -268,7 +268,7 @@ class weighted_joint_deviation:
     ) -> torch.Tensor:
         """Return the cost, (N,)."""
         asset: Entity = env.scene[asset_cfg.name]
-        joints = columns(asset_cfg.joint_ids, env.device)
+        joints = as_columns(asset_cfg.joint_ids, env.device)
         error = asset.data.joint_pos[:, joints] - asset.data.default_joint_pos[:, joints]
         return (error.square_() * self._weights).sum(dim=1)
 
@@ -303,9 +303,9 @@ class feet_tilt:
         """Return the cost, (N,)."""
         data = env.scene[asset_cfg.name].data
         if asset_cfg.site_names:
-            quat = data.site_quat_w[:, columns(asset_cfg.site_ids, env.device)]
+            quat = data.site_quat_w[:, as_columns(asset_cfg.site_ids, env.device)]
         else:
-            quat = data.body_link_quat_w[:, columns(asset_cfg.body_ids, env.device)]
+            quat = data.body_link_quat_w[:, as_columns(asset_cfg.body_ids, env.device)]
         up = quat_apply_inverse(quat, self._up.expand(*quat.shape[:-1], 3))
         # The length of a cross product, because 1 - cos^2 of a small angle is rounded away.
         return torch.linalg.cross(up, self._rest.expand_as(up)).square_().sum(dim=(1, 2))
@@ -331,7 +331,7 @@ def _up_at_rest(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tens
 def height_over_feet(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
     """Return the height of the root above the lowest of the feet (m), (N,); feet as `site_names`."""
     data = env.scene[asset_cfg.name].data
-    feet = data.site_pos_w[:, columns(asset_cfg.site_ids, env.device), 2]
+    feet = data.site_pos_w[:, as_columns(asset_cfg.site_ids, env.device), 2]
     return data.root_link_pos_w[:, 2] - feet.amin(dim=1)
 
 
@@ -362,6 +362,6 @@ def feet_apart_l2(
     or with `preserve_order`.
     """
     data = env.scene[asset_cfg.name].data
-    feet = data.site_pos_w[:, columns(asset_cfg.site_ids, env.device)]
+    feet = data.site_pos_w[:, as_columns(asset_cfg.site_ids, env.device)]
     apart = quat_apply_inverse(data.root_link_quat_w, feet[:, 0] - feet[:, 1])[:, 1]
     return (distance - apart).clamp_(min=0.0).square_()

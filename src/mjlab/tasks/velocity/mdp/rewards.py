@@ -34,7 +34,7 @@ from mjlab.tasks.velocity.mdp.observations import (
     site_columns,
 )
 from mjlab.tasks.velocity.mdp.terrain_utils import terrain_normal_from_sensors
-from mjlab.utils.indexing import columns
+from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
 from mjlab.utils.lab_api.string import resolve_matching_names_values
 
@@ -404,7 +404,7 @@ def soft_landing(
 def _site_speed(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
     """Return the horizontal speed of the selected sites, (N, sites), in m/s."""
     asset: Entity = env.scene[asset_cfg.name]
-    sites = columns(asset_cfg.site_ids, env.device)
+    sites = as_columns(asset_cfg.site_ids, env.device)
     velocity = asset.data.site_lin_vel_w[:, sites]
     # By components: a norm over a last dimension of two takes a CPU longer.
     return velocity[..., 0].square().addcmul_(velocity[..., 1], velocity[..., 1]).sqrt_()
@@ -643,7 +643,7 @@ class variable_posture:
     ) -> torch.Tensor:
         """Return the reward."""
         asset: Entity = env.scene[asset_cfg.name]
-        joints = columns(asset_cfg.joint_ids, env.device)
+        joints = as_columns(asset_cfg.joint_ids, env.device)
         error = asset.data.joint_pos[:, joints] - asset.data.default_joint_pos[:, joints]
         speed = command_speed(env, command_name)
         gait = (speed >= walking_threshold).long() + (speed >= running_threshold).long()
