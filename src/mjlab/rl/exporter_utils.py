@@ -416,6 +416,7 @@ class OnnxPolicy:
         num_observations: Size of the flat observation of one environment; 0 if it sees images only.
         num_actions: Size of the action of one environment.
         image_shapes: For each group of images that it sees, (channels, height, width).
+        groups: Groups of observations that the policy reads.
     """
 
     def __init__(self, path: str | Path, device: str = "cpu", num_envs: int = 1) -> None:
@@ -434,16 +435,8 @@ class OnnxPolicy:
         self.path = Path(path)
         self.device = device
         model = _read_model(self.path)
-        graph = model.graph
         self.metadata: dict[str, str] = {item.key: item.value for item in model.metadata_props}
-        # Not refused, because people optimize graphs.
-        written = self.metadata.get(DIGEST_KEY)
-        if written is not None and written != initializers_digest(model):
-            logger.warning(
-                "The weights in %s are not those that were exported (%s differs): the file was edited "
-                "or damaged.", self.path, DIGEST_KEY,
-            )  # fmt: skip
-        outputs = {item.name: _dims(item) for item in graph.output}
+        outputs = {item.name: _dims(item) for item in model.graph.output}
         if _ACTIONS not in outputs and len(outputs) != 1:
             raise OnnxPolicyError(
                 f"The policy {self.path} has the outputs {list(outputs)}, of which none is called "
@@ -451,29 +444,18 @@ class OnnxPolicy:
             )
         actions = _ACTIONS if _ACTIONS in outputs else next(iter(outputs))
         self.num_actions = outputs[actions][-1]
-        self._memories = _memories((item.name for item in graph.input), outputs)
+        self._memories = _memories((item.name for item in model.graph.input), outputs)
         self._outputs = [actions, *self._memories.values()]
-        _keep_only(graph, self._outputs)
-        inputs = {item.name: _dims(item) for item in graph.input}
-        self._memory_shapes = {name: inputs.pop(name) for name in self._memories}
-        flat = [name for name, dims in inputs.items() if len(dims) == 2]
-        self.image_shapes = {
-            name: tuple(dims[1:]) for name, dims in inputs.items() if len(dims) == 4
-        }
-        batches = [size for dims in inputs.values() for size in dims[:1]]
-        batches += [size for dims in self._memory_shapes.values() for size in dims[1:2]]
-        is_known = len(flat) <= 1 and len(flat) + len(self.image_shapes) == len(inputs) > 0
-        if not is_known or max(batches) > 1:
-            raise OnnxPolicyError(
-                f"The actions of the policy {self.path} depend on the inputs {list(inputs)} of sizes "
-                f"{list(inputs.values())}; one flat input, any number of images and a memory (`h_in` "
-                "with an output `h_out`), for one environment or any number, can be played here. "
-                "Play the checkpoint (model_<iteration>.pt) instead."
-            )
-        self._state = flat[0] if flat else None
-        self.num_observations = inputs[flat[0]][-1] if flat else 0
-        # The size of a dynamic dimension reads 0.
-        self._is_for_one = max(batches) == 1
+        _keep_only(model.graph, self._outputs)
+        self._read_inputs(model.graph)
+        # Groups that make up the flat observation, in order; None if the file does not say so.
+        self._named_groups: list[str] | None = None
+        if self._state is None:
+            self._named_groups = []
+        elif "observation_group" in self.metadata:
+            self._named_groups = self.metadata["observation_group"].split(",")
+        self._flat_groups = ["actor"] if self._named_groups is None else self._named_groups
+        self.groups = [*self.image_shapes, *self._flat_groups]
         self._memory: dict[str, np.ndarray] = {}
         self._session = _make_session(self.path, model, 1 if self._is_for_one else num_envs)
 
@@ -490,7 +472,7 @@ class OnnxPolicy:
             inputs[self._state] = _array(
                 observations
                 if isinstance(observations, torch.Tensor)
-                else torch.cat([observations[name] for name in self._flat_groups()], dim=-1)
+                else torch.cat([observations[name] for name in self._flat_groups], dim=-1)
             )
         count = len(next(iter(inputs.values())))
         if not self._memory:
@@ -526,7 +508,7 @@ class OnnxPolicy:
         """
         differences = self._group_differences(env)
         if not differences:
-            wanted = metadata_texts(get_base_metadata(env, "", self._named_groups()))
+            wanted = metadata_texts(get_base_metadata(env, "", self._named_groups))
             own = {key: self.metadata[key] for key in _INTERFACE if key in self.metadata}
             own |= {key: self.metadata.get(key, "") for key in _CLOCK}
             differences = [
@@ -544,24 +526,9 @@ class OnnxPolicy:
                 + "."
             )
 
-    @property
-    def groups(self) -> list[str]:
-        """The groups of observations that the policy reads."""
-        return [*self.image_shapes, *self._flat_groups()]
-
-    def _flat_groups(self) -> list[str]:
-        return [] if self._state is None else self._named_groups() or ["actor"]
-
-    def _named_groups(self) -> list[str] | None:
-        """Return the groups that make up the flat observation, in order, if the file says so."""
-        if self._state is None:
-            return []
-        names = self.metadata.get("observation_group")
-        return None if names is None else names.split(",")
-
     def _group_differences(self, env: ManagerBasedRlEnv) -> list[str]:
         """Return, one text each, the groups of observations that the environment has not."""
-        groups = self._named_groups() or []
+        groups = self._named_groups or []
         if not groups and not self.image_shapes:
             return []
         shapes: dict[str, Any] = env.observation_manager.group_obs_dim
@@ -577,6 +544,28 @@ class OnnxPolicy:
                     f"images {name!r}: the policy has {shape}, the environment {found}"
                 )
         return differences
+
+    def _read_inputs(self, graph: Any) -> None:
+        inputs = {item.name: _dims(item) for item in graph.input}
+        self._memory_shapes = {name: inputs.pop(name) for name in self._memories}
+        flat = [name for name, dims in inputs.items() if len(dims) == 2]
+        self._state = flat[0] if flat else None
+        self.num_observations = inputs[flat[0]][-1] if flat else 0
+        self.image_shapes = {
+            name: tuple(dims[1:]) for name, dims in inputs.items() if len(dims) == 4
+        }
+        batches = [size for dims in inputs.values() for size in dims[:1]]
+        batches += [size for dims in self._memory_shapes.values() for size in dims[1:2]]
+        is_known = len(flat) <= 1 and len(flat) + len(self.image_shapes) == len(inputs) > 0
+        if not is_known or max(batches) > 1:
+            raise OnnxPolicyError(
+                f"The actions of the policy {self.path} depend on the inputs {list(inputs)} of sizes "
+                f"{list(inputs.values())}; one flat input, any number of images and a memory (`h_in` "
+                "with an output `h_out`), for one environment or any number, can be played here. "
+                "Play the checkpoint (model_<iteration>.pt) instead."
+            )
+        # The size of a dynamic dimension reads 0.
+        self._is_for_one = max(batches) == 1
 
     def _run(self, inputs: dict[str, np.ndarray], rows: slice) -> list[np.ndarray]:
         """Return the actions and the next memory of some environments."""
@@ -598,6 +587,13 @@ def _read_model(path: Path) -> Any:
         ) from error
     if not model.graph.node:
         raise OnnxPolicyError(f"{path} is not an ONNX file that can be read: it has no graph.")
+    # Not refused, because people optimize graphs.
+    written = {item.key: item.value for item in model.metadata_props}.get(DIGEST_KEY)
+    if written is not None and written != initializers_digest(model):
+        logger.warning(
+            "The weights in %s are not those that were exported (%s differs): the file was edited or "
+            "damaged.", path, DIGEST_KEY,
+        )  # fmt: skip
     return model
 
 
