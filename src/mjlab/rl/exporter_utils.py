@@ -38,7 +38,7 @@ import io
 import logging
 import math
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,6 +79,33 @@ _ABSOLUTE_TOLERANCE = 6e-4
 
 
 # Export.
+
+
+def export_with_metadata(
+    write: Callable[[str, str], None], metadata: Callable[[], Metadata], path: str
+) -> bool:
+    """Write a policy as ONNX with all that a deployment needs to know; return whether it was written.
+
+    Failures are logged: a run is not lost because its policy has no ONNX form.
+
+    Args:
+        write: Called as `write(folder, filename)`.
+        metadata: Returns the metadata.
+        path: The file.
+    """
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        write(str(target.parent), target.name)
+    except Exception as error:
+        logger.warning("The policy was not exported to %s: %s", path, error)
+        return False
+    try:
+        digest = {DIGEST_KEY: initializers_digest(path)}
+        attach_metadata_to_onnx(path, {**metadata(), **digest})
+    except Exception as error:
+        logger.warning("The exported policy %s is without metadata: %s", path, error)
+    return True
 
 
 def export_to_onnx(model: Any, path: Path, verbose: bool = False) -> None:
