@@ -36,7 +36,7 @@ _OUTPUT = 100_000
 _KEPT = 1 << 20
 # What commands import late; forked processes should have it.
 _IMPORTS = (
-    "mjlab.envs", "mjlab.rl", "mjlab.rl.evaluation", "mjlab.rl.onnx_policy", "mjlab.rl.plot",
+    "mjlab.envs", "mjlab.rl", "mjlab.rl.evaluation", "mjlab.rl.exporter_utils", "mjlab.rl.plot",
     "mjlab.rl.run_logger", "mjlab.rl.sac", "mjlab.scripts.play", "mjlab.scripts.display",
     "mjlab.scripts.evaluate", "mjlab.scripts.export_scene", "mjlab.scripts.play",
     "mjlab.scripts.profile_env", "mjlab.scripts.resume", "mjlab.scripts.train",

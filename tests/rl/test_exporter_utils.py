@@ -108,14 +108,14 @@ def test_the_onnx_policy_computes_what_the_torch_policy_does(make_runner, tmp_pa
     runner.learn(3)
     path = tmp_path / "run" / "run.onnx"
     session = onnxruntime.InferenceSession(str(path))
-    assert [(x.name, x.shape) for x in session.get_inputs()] == [("obs", [1, 2])]
-    assert [(x.name, x.shape) for x in session.get_outputs()] == [("actions", [1, 2])]
+    assert [(x.name, x.shape) for x in session.get_inputs()] == [("obs", ["batch", 2])]
+    assert [(x.name, x.shape) for x in session.get_outputs()] == [("actions", ["batch", 2])]
     assert {o.version for o in onnx.load(str(path)).opset_import if o.domain == ""} == {18}
     policy = runner.get_inference_policy()
-    for row in torch.randn(20, 1, 2, generator=torch.Generator().manual_seed(0)):
+    for rows in torch.randn(20, 3, 2, generator=torch.Generator().manual_seed(0)):
         with torch.no_grad():
-            expected = policy({"actor": 3 * row}).numpy()
-        (actual,) = session.run(["actions"], {"obs": (3 * row).numpy()})
+            expected = policy({"actor": 3 * rows}).numpy()
+        (actual,) = session.run(["actions"], {"obs": (3 * rows).numpy()})
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-5)
 
 

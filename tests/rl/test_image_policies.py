@@ -20,9 +20,8 @@ from mjlab.managers import ObservationGroupCfg, ObservationTermCfg
 from mjlab.rl import MjlabOnPolicyRunner, RslRlModelCfg, RslRlVecEnvWrapper
 from mjlab.rl.config import RslRlOnPolicyRunnerCfg, RslRlPpoAlgorithmCfg
 from mjlab.rl.evaluation import evaluate_policy
-from mjlab.rl.exporter_utils import export_to_onnx
+from mjlab.rl.exporter_utils import OnnxPolicy, OnnxPolicyError, export_to_onnx, load_onnx_policy
 from mjlab.rl.networks import check_networks
-from mjlab.rl.onnx_policy import OnnxPolicy, OnnxPolicyError, load_onnx_policy
 from mjlab.rl.rsl import CNNModel, TensorDict
 from mjlab.rl.spatial_softmax import SpatialSoftmaxCNNModel
 from mjlab.tasks.registry import load_env_cfg
@@ -106,7 +105,7 @@ def trained(env: RslRlVecEnvWrapper, tmp_path: Path) -> Trained:
 
 
 def onnxruntime_actions(path: Path, groups: tuple[str, ...], observations: Any) -> np.ndarray:
-    """Actions of all environments, one by one: the export is for one."""
+    """Actions of all environments."""
     session = onnxruntime.InferenceSession(str(path))
     images = [name for name in groups if observations[name].ndim == 4]
     flat = [observations[name] for name in groups if name not in images]
@@ -114,9 +113,7 @@ def onnxruntime_actions(path: Path, groups: tuple[str, ...], observations: Any) 
     if flat:
         given["obs"] = torch.cat(flat, dim=-1)
     assert {entry.name for entry in session.get_inputs()} == set(given)
-    rows = range(len(observations))
-    feeds = [{k: v[i : i + 1].numpy() for k, v in given.items()} for i in rows]
-    return np.concatenate([session.run(None, feed)[0] for feed in feeds])
+    return session.run(None, {name: value.numpy() for name, value in given.items()})[0]
 
 
 SETTINGS = {

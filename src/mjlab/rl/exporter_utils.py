@@ -1,7 +1,11 @@
-"""What a deployment has to know about an exported policy, written into the ONNX file.
+"""Policies as ONNX files: export, metadata for a deployment, and playing them by onnxruntime.
 
-Each key is one string property of the file; lists are comma-separated. The keys of mjlab 1.6 come
-first, in its order and layout; numbers have full precision, and more keys follow:
+A file takes any number of environments (a dynamic batch dimension). Recurrent policies have one input
+and one output for each part of their memory, as rsl_rl names them: `h_in` and `h_out`, for LSTMs also
+`c_in` and `c_out`, (layers, N, hidden).
+
+Each key of the metadata is one string property of the file; lists are comma-separated. The keys of
+mjlab 1.6 come first, in its order and layout; numbers have full precision, and more keys follow:
 
 | key | value |
 | --- | --- |
@@ -32,22 +36,49 @@ from __future__ import annotations
 import hashlib
 import io
 import logging
+import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from mjlab.rl.checkpoint import CheckpointError
 from mjlab.utils.os import replacing
+from mjlab.utils.torch import torch_threads
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
+
 Metadata = dict[str, list | str | float]
-DIGEST_KEY = "initializers_sha256"
 logger = logging.getLogger(__name__)
+
+OPSET = 18
+DIGEST_KEY = "initializers_sha256"
+_ACTIONS = "actions"
+# Metadata that must be the same where a policy was trained and where it is played. Numbers are
+# compared with a tolerance, because mjlab 1.6 writes three decimals.
+_INTERFACE = (
+    "observation_names",
+    "observation_dims",
+    "observation_terms_scale",
+    "observation_terms_history_length",
+    "action_target_names",
+    "action_scale",
+    "action_offset",
+    "default_joint_pos",
+    "step_dt",
+)
+# Files without these are of policies that see no gait clock.
+_CLOCK = ("clock_frequency", "clock_fade_s", "clock_standing_threshold", "clock_starts")
+_RELATIVE_TOLERANCE = 0.01
+_ABSOLUTE_TOLERANCE = 6e-4
+
+
+# Export.
 
 
 def export_with_metadata(
@@ -77,75 +108,69 @@ def export_with_metadata(
     return True
 
 
-def list_to_csv_str(
-    arr: Any, *, decimals: int | None = 3, delimiter: str = ",", sub_delimiter: str = ";"
-) -> str:
-    """Return the items of `arr`, joined by `delimiter`; nested lists by `sub_delimiter`.
+def export_to_onnx(model: Any, path: Path, verbose: bool = False) -> None:
+    """Write `model`, what rsl_rl's `as_onnx` returns, to `path`, for any number of environments.
 
-    Numbers get `decimals` decimals, booleans counting as 1 and 0; None writes them in full, as
-    short as reads back to the same number. Everything else is `str`.
+    The exporter is the one that traces (`dynamo=False`): it needs neither the compiler nor
+    onnxscript, whose imports alone take longer than the whole export, and it makes one file.
     """
-    return delimiter.join(
-        list_to_csv_str(item, decimals=decimals, delimiter=sub_delimiter)
-        if isinstance(item, (list, tuple))
-        else _item_to_str(item, decimals)
-        for item in _as_list(arr)
-    )
+    if getattr(model, "obs_dim_1d", None) == 0:
+        model = _ImagesOnly(model)
+    model.to("cpu")
+    model.eval()
+    memories = _memories(model.input_names, model.output_names)
+    second = {*memories, *memories.values()}
+    buffer: Any = io.BytesIO()
+    exporter_log = logging.getLogger("torch.onnx")
+    level = exporter_log.level
+    with warnings.catch_warnings():
+        if not verbose:
+            warnings.simplefilter("ignore")
+            exporter_log.setLevel(logging.ERROR)
+        try:
+            torch.onnx.export(
+                model,
+                model.get_dummy_inputs(),
+                buffer,
+                export_params=True,
+                opset_version=OPSET,
+                verbose=verbose,
+                input_names=model.input_names,
+                output_names=model.output_names,
+                dynamic_axes={
+                    name: {1 if name in second else 0: "batch"}
+                    for name in (*model.input_names, *model.output_names)
+                },
+                dynamo=False,
+            )
+        finally:
+            exporter_log.setLevel(level)
+    write_atomically(path, buffer.getvalue())
 
 
-def _item_to_str(item: Any, decimals: int | None) -> str:
-    if not isinstance(item, (bool, int, float, np.bool_, np.number)):
-        return str(item)
-    if decimals is not None:
-        return f"{item:.{decimals}f}"
-    if isinstance(item, (bool, np.bool_)):
-        return str(int(item))
-    return str(item)
+class _ImagesOnly(torch.nn.Module):
+    """An image model without flat observations, and without the empty input for them."""
+
+    def __init__(self, model: Any) -> None:
+        super().__init__()
+        self.model = model
+        self.input_names = model.input_names[1:]
+        self.output_names = model.output_names
+
+    def get_dummy_inputs(self) -> tuple[torch.Tensor, ...]:
+        """Return images of zeros."""
+        return self.model.get_dummy_inputs()[1:]
+
+    def forward(self, *images: torch.Tensor) -> torch.Tensor:
+        """Return the actions for the images of each group."""
+        return self.model(images[0].new_zeros(images[0].shape[0], 0), *images)
 
 
-def _as_list(values: Any) -> list:
-    return values.tolist() if hasattr(values, "tolist") else list(values)
-
-
-def attach_metadata_to_onnx(onnx_path: str, metadata: Mapping[str, list | str | float]) -> None:
-    """Write `metadata` into the ONNX file; keys that it has already are replaced.
-
-    The file is replaced as a whole, so it is never seen half written.
-    """
-    import onnx
-
-    model = onnx.load(onnx_path)
-    kept = {entry.key: entry.value for entry in model.metadata_props}
-    del model.metadata_props[:]
-    for key, value in {**kept, **metadata_texts(metadata)}.items():
-        model.metadata_props.add(key=key, value=value)
-    write_atomically(Path(onnx_path), model.SerializeToString())
-
-
-def initializers_digest(path: str | Path) -> str:
-    """Return the SHA-256 (hexadecimal) over the initializers of an ONNX file: the policy's weights.
-
-    Over each, in order of their names: name, NumPy type and shape, a line each, and the values.
-    """
-    import onnx
-
-    digest = hashlib.sha256()
-    initializers = onnx.load(str(path)).graph.initializer
-    for tensor in sorted(initializers, key=lambda tensor: tensor.name):
-        values = onnx.numpy_helper.to_array(tensor)
-        digest.update(f"{tensor.name}\n{values.dtype}\n{values.shape}\n".encode())
-        digest.update(values.tobytes())
-    return digest.hexdigest()
-
-
-def metadata_texts(metadata: Mapping[str, list | str | float]) -> dict[str, str]:
-    """Return `metadata` as the strings that the ONNX file keeps."""
-    return {
-        key: list_to_csv_str(value, decimals=None)
-        if isinstance(value, (list, tuple))
-        else _item_to_str(value, None)
-        for key, value in metadata.items()
-    }
+def _memories(inputs: Iterable[str], outputs: Iterable[str]) -> dict[str, str]:
+    """Return the inputs that hold memory, with the outputs that they are in the next step."""
+    pairs = {name: f"{name.removesuffix('_in')}_out" for name in inputs if name.endswith("_in")}
+    known = set(outputs)
+    return {before: after for before, after in pairs.items() if after in known}
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -153,6 +178,9 @@ def write_atomically(path: Path, content: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
         file.write(content)
+
+
+# Metadata.
 
 
 def get_base_metadata(
@@ -170,50 +198,28 @@ def get_base_metadata(
     among them, else that of the first action term.
     """
     metadata: Metadata = {"run_path": run_path}
-    entity = _controlled_entity(env)
-    if entity is not None:
+    actions = env.action_manager
+    terms: dict[str, Any] = {name: actions.get_term(name) for name in actions.active_terms}
+    entities = [term.cfg.entity_name for term in terms.values()]
+    if entities:
+        entity = env.scene["robot" if "robot" in entities else entities[0]]
         metadata.update(_joint_metadata(env, entity))
     metadata["command_names"] = list(env.command_manager.active_terms)
     for name in env.command_manager.active_terms:
         if (term := env.command_manager.get_term(name)) is not None:
             metadata.update(term.export_metadata(name))
     metadata.update(_observation_metadata(env, observation_groups))
-    metadata.update(_action_metadata(env))
+    metadata.update(_action_metadata(terms))
     metadata["step_dt"] = _shortest(env.step_dt)
     metadata["physics_dt"] = _shortest(env.physics_dt)
     metadata["decimation"] = env.cfg.decimation
     return metadata
 
 
-def _action_terms(env: ManagerBasedRlEnv) -> dict[str, Any]:
-    return {name: env.action_manager.get_term(name) for name in env.action_manager.active_terms}
-
-
-def _controlled_entity(env: ManagerBasedRlEnv) -> Entity | None:
-    names = [term.cfg.entity_name for term in _action_terms(env).values()]
-    if not names:
-        return None
-    return env.scene["robot" if "robot" in names else names[0]]
-
-
 def _joint_metadata(env: ManagerBasedRlEnv, entity: Entity) -> Metadata:
-    stiffness, damping = _gains_by_joint(env, entity)
-    actuated = [name for name in entity.joint_names if name in stiffness]
-    default = entity.data.default_joint_pos
-    return {
-        "joint_names": list(entity.joint_names),
-        "joint_stiffness": [stiffness[name] for name in actuated],
-        "joint_damping": [damping[name] for name in actuated],
-        "default_joint_pos": _numbers(default[0]) if default is not None else [],
-    }
-
-
-def _gains_by_joint(
-    env: ManagerBasedRlEnv, entity: Entity
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Return PD gains as configured (not as randomized) by joint; 0 for an actuator without."""
-    stiffness: dict[str, float] = {}
-    damping: dict[str, float] = {}
+    """Return names, PD gains as configured (not as randomized) and default positions of joints."""
+    gains: dict[str, tuple[float, float]] = {}
+    affine = 1  # mujoco.mjtBias.mjBIAS_AFFINE
     model = env.sim.mj_model
     for actuator in entity.actuators:
         if str(getattr(actuator.transmission_type, "value", "joint")) != "joint":
@@ -222,20 +228,21 @@ def _gains_by_joint(
         for k, name in enumerate(actuator.target_names):
             # Elements of one target follow each other; the first holds the gains.
             element = elements[k * len(elements) // len(actuator.target_names)]
-            kp, kd = _mujoco_gains(model, element)
+            # The bias of a position or velocity servo is -kp l - kd l'.
+            has_gains = int(model.actuator_biastype[element]) == affine
+            bias = model.actuator_biasprm[element] if has_gains else np.zeros(3)
             # A PD law that is computed outside MuJoCo is not in the model, but in the config.
-            stiffness[name] = float(getattr(actuator.cfg, "stiffness", kp))
-            damping[name] = float(getattr(actuator.cfg, "damping", kd))
-    return stiffness, damping
-
-
-def _mujoco_gains(model: Any, element: int) -> tuple[float, float]:
-    """Return kp and kd of the affine bias -kp l - kd l' of a position or velocity servo."""
-    affine = 1  # mujoco.mjtBias.mjBIAS_AFFINE
-    if int(model.actuator_biastype[element]) != affine:
-        return 0.0, 0.0
-    bias = model.actuator_biasprm[element]
-    return float(0.0 - bias[1]), float(0.0 - bias[2])
+            kp = getattr(actuator.cfg, "stiffness", 0.0 - bias[1])
+            kd = getattr(actuator.cfg, "damping", 0.0 - bias[2])
+            gains[name] = float(kp), float(kd)
+    actuated = [name for name in entity.joint_names if name in gains]
+    default = entity.data.default_joint_pos
+    return {
+        "joint_names": list(entity.joint_names),
+        "joint_stiffness": [gains[name][0] for name in actuated],
+        "joint_damping": [gains[name][1] for name in actuated],
+        "default_joint_pos": _numbers(default[0]) if default is not None else [],
+    }
 
 
 def _observation_metadata(env: ManagerBasedRlEnv, groups: Sequence[str] | None) -> Metadata:
@@ -269,17 +276,25 @@ def _scale(scale: Any) -> float | list[float]:
     return list(scale) if isinstance(scale, (list, tuple)) else float(scale)
 
 
-def _action_metadata(env: ManagerBasedRlEnv) -> Metadata:
-    terms = _action_terms(env)
+def _action_metadata(terms: Mapping[str, Any]) -> Metadata:
     scales = [getattr(term, "_scale", 1.0) for term in terms.values()]
     several = len({term.cfg.entity_name for term in terms.values()}) > 1
     components: dict[str, list] = {"names": [], "scale": [], "offset": [], "clip": []}
     for name, term in terms.items():
         prefix = f"{term.cfg.entity_name}/" if several else ""
-        components["names"] += [prefix + target for target in _target_names(name, term)]
+        targets: list[str] = list(getattr(term, "_target_names", ()))
+        if len(targets) != term.action_dim:
+            # The term drives nothing that has a name.
+            targets = [f"{name}_{k}" for k in range(term.action_dim)]
+        clip = getattr(term, "_clip", None)
+        components["names"] += [prefix + target for target in targets]
         components["scale"] += _per_component(term, "_scale", 1.0)
         components["offset"] += _per_component(term, "_offset", 0.0)
-        components["clip"] += _clip_per_component(term)
+        components["clip"] += (
+            [_numbers(bounds) for bounds in clip[0]]
+            if isinstance(clip, torch.Tensor)
+            else [[-np.inf, np.inf]] * term.action_dim
+        )
     # One number where one number was configured, as mjlab 1.6 writes it.
     single = len(scales) == 1 and isinstance(scales[0], (int, float))
     return {
@@ -294,27 +309,12 @@ def _action_metadata(env: ManagerBasedRlEnv) -> Metadata:
     }
 
 
-def _target_names(name: str, term: Any) -> list[str]:
-    """Return what each component drives; terms that drive no named thing number them."""
-    names: list[str] = list(getattr(term, "_target_names", ()))
-    if len(names) == term.action_dim:
-        return names
-    return [f"{name}_{k}" for k in range(term.action_dim)]
-
-
 def _per_component(term: Any, attribute: str, default: float) -> list[float]:
     value = getattr(term, attribute, default)
     if isinstance(value, torch.Tensor):
         row = value[0] if value.ndim > 1 else value
         return _numbers(row.expand(term.action_dim))
     return [float(value)] * term.action_dim
-
-
-def _clip_per_component(term: Any) -> list[list[float]]:
-    clip = getattr(term, "_clip", None)
-    if not isinstance(clip, torch.Tensor):
-        return [[-np.inf, np.inf]] * term.action_dim
-    return [_numbers(bounds) for bounds in clip[0]]
 
 
 def _numbers(values: torch.Tensor) -> list[float]:
@@ -326,59 +326,371 @@ def _shortest(value: float) -> float:
     return float(str(np.float32(value)))
 
 
-# MERGED mjlab.rl.exporter_utils: Export of a network to ONNX.
+def attach_metadata_to_onnx(onnx_path: str, metadata: Mapping[str, list | str | float]) -> None:
+    """Write `metadata` into the ONNX file; keys that it has already are replaced.
 
-OPSET = 18
-
-
-def export_to_onnx(model: Any, path: Path, verbose: bool = False) -> None:
-    """Write `model`, what rsl_rl's `as_onnx` returns, to `path` with a batch size of 1.
-
-    The exporter is the one that traces (`dynamo=False`): it needs neither the compiler nor
-    onnxscript, whose imports alone take longer than the whole export, and it makes one file.
+    The file is replaced as a whole, so it is never seen half written.
     """
-    if getattr(model, "obs_dim_1d", None) == 0:
-        model = _ImagesOnly(model)
-    model.to("cpu")
-    model.eval()
-    buffer: Any = io.BytesIO()
-    exporter_log = logging.getLogger("torch.onnx")
-    level = exporter_log.level
-    with warnings.catch_warnings():
-        if not verbose:
-            warnings.simplefilter("ignore")
-            exporter_log.setLevel(logging.ERROR)
-        try:
-            torch.onnx.export(
-                model,
-                model.get_dummy_inputs(),
-                buffer,
-                export_params=True,
-                opset_version=OPSET,
-                verbose=verbose,
-                input_names=model.input_names,
-                output_names=model.output_names,
-                dynamic_axes={},
-                dynamo=False,
+    import onnx
+
+    model = onnx.load(onnx_path)
+    kept = {entry.key: entry.value for entry in model.metadata_props}
+    del model.metadata_props[:]
+    for key, value in {**kept, **metadata_texts(metadata)}.items():
+        model.metadata_props.add(key=key, value=value)
+    write_atomically(Path(onnx_path), model.SerializeToString())
+
+
+def metadata_texts(metadata: Mapping[str, list | str | float]) -> dict[str, str]:
+    """Return `metadata` as the strings that the ONNX file keeps."""
+    return {
+        key: list_to_csv_str(value, decimals=None)
+        if isinstance(value, (list, tuple))
+        else _text(value, None)
+        for key, value in metadata.items()
+    }
+
+
+def list_to_csv_str(
+    arr: Any, *, decimals: int | None = 3, delimiter: str = ",", sub_delimiter: str = ";"
+) -> str:
+    """Return the items of `arr`, joined by `delimiter`; nested lists by `sub_delimiter`.
+
+    Numbers get `decimals` decimals, booleans counting as 1 and 0; None writes them in full, as
+    short as reads back to the same number. Everything else is `str`.
+    """
+    return delimiter.join(
+        list_to_csv_str(item, decimals=decimals, delimiter=sub_delimiter)
+        if isinstance(item, (list, tuple))
+        else _text(item, decimals)
+        for item in (arr.tolist() if hasattr(arr, "tolist") else arr)
+    )
+
+
+def _text(item: Any, decimals: int | None) -> str:
+    if not isinstance(item, (bool, int, float, np.bool_, np.number)):
+        return str(item)
+    if decimals is not None:
+        return f"{item:.{decimals}f}"
+    if isinstance(item, (bool, np.bool_)):
+        return str(int(item))
+    return str(item)
+
+
+def initializers_digest(model: str | Path | Any) -> str:
+    """Return the SHA-256 (hexadecimal) over the initializers of an ONNX file: the policy's weights.
+
+    Over each, in order of their names: name, NumPy type and shape, a line each, and the values.
+
+    Args:
+        model: The file, or what `onnx.load` returned for it.
+    """
+    import onnx
+
+    if isinstance(model, str | Path):
+        model = onnx.load(str(model))
+    digest = hashlib.sha256()
+    for tensor in sorted(model.graph.initializer, key=lambda tensor: tensor.name):
+        values = onnx.numpy_helper.to_array(tensor)
+        digest.update(f"{tensor.name}\n{values.dtype}\n{values.shape}\n".encode())
+        digest.update(values.tobytes())
+    return digest.hexdigest()
+
+
+# Playing.
+
+
+class OnnxPolicyError(CheckpointError):
+    """Raised for a file that is no policy that can be played here; the text says why."""
+
+
+def load_onnx_policy(path: Path, env: Any, device: str) -> OnnxPolicy:
+    """Return the policy in `path`, which fits the wrapped environment `env`.
+
+    Raises:
+        OnnxPolicyError: it cannot be played, or not in this environment.
+    """
+    try:
+        policy = OnnxPolicy(path, device, env.unwrapped.num_envs)
+        policy.check_fits(env.unwrapped)
+        # Once, so that a damaged graph is told before anything is shown or measured.
+        shapes = env.unwrapped.observation_manager.group_obs_dim
+        policy({name: torch.zeros(2, *shapes[name], device=device) for name in policy.groups})
+        policy.reset()
+    except OnnxPolicyError:
+        raise
+    except Exception as error:
+        raise OnnxPolicyError(
+            f"The policy {path} cannot be computed: {_first_line(error)}. The file is damaged, or "
+            "not a policy of this environment."
+        ) from error
+    return policy
+
+
+class OnnxPolicy:
+    """A policy that was exported to ONNX, for any number of environments, on the CPU.
+
+    Called with observations, it returns actions (N, num_actions). One with a memory remembers what it
+    was called with before, until `reset`. Files with a fixed batch size of 1, which earlier releases
+    wrote, are run once for each environment.
+
+    A file may have further outputs, and inputs that these depend on; they are left out. Exported
+    policies of motion tracking return the reference at an input `time_step`, which is of use on a
+    robot, and which an environment has itself.
+
+    Attributes:
+        metadata: What the file says about itself; see `mjlab.rl.exporter_utils`.
+        num_observations: Size of the flat observation of one environment; 0 if it sees images only.
+        num_actions: Size of the action of one environment.
+        image_shapes: For each group of images that it sees, (channels, height, width).
+        groups: Groups of observations that the policy reads.
+    """
+
+    def __init__(self, path: str | Path, device: str = "cpu", num_envs: int = 1) -> None:
+        """Read the file.
+
+        Args:
+            path: The ONNX file.
+            device: Torch device of the actions. They are computed on the CPU.
+            num_envs: Number of environments that it will mostly be called with; decides on threads.
+
+        Raises:
+            OnnxPolicyError: the file is missing, no ONNX file, has no output that is called
+                `actions` nor only one; or the actions depend on other inputs than a flat
+                observation, images and a memory.
+        """
+        self.path = Path(path)
+        self.device = device
+        model = _read_model(self.path)
+        self.metadata: dict[str, str] = {item.key: item.value for item in model.metadata_props}
+        outputs = {item.name: _dims(item) for item in model.graph.output}
+        if _ACTIONS not in outputs and len(outputs) != 1:
+            raise OnnxPolicyError(
+                f"The policy {self.path} has the outputs {list(outputs)}, of which none is called "
+                f"{_ACTIONS!r}. Play the checkpoint (model_<iteration>.pt) instead."
             )
-        finally:
-            exporter_log.setLevel(level)
-    write_atomically(path, buffer.getvalue())
+        actions = _ACTIONS if _ACTIONS in outputs else next(iter(outputs))
+        self.num_actions = outputs[actions][-1]
+        self._memories = _memories((item.name for item in model.graph.input), outputs)
+        self._outputs = [actions, *self._memories.values()]
+        _keep_only(model.graph, self._outputs)
+        self._read_inputs(model.graph)
+        # Groups that make up the flat observation, in order; None if the file does not say so.
+        self._named_groups: list[str] | None = None
+        if self._state is None:
+            self._named_groups = []
+        elif "observation_group" in self.metadata:
+            self._named_groups = self.metadata["observation_group"].split(",")
+        self._flat_groups = ["actor"] if self._named_groups is None else self._named_groups
+        self.groups = [*self.image_shapes, *self._flat_groups]
+        self._memory: dict[str, np.ndarray] = {}
+        self._session = _make_session(self.path, model, 1 if self._is_for_one else num_envs)
+
+    def __call__(self, observations: Any) -> torch.Tensor:
+        """Return actions (N, num_actions).
+
+        Args:
+            observations: The environment's groups of observations, of which those that the policy
+                was trained with are taken; or, for a policy without images, a tensor
+                (N, num_observations).
+        """
+        inputs = {name: _array(observations[name]) for name in self.image_shapes}
+        if self._state is not None:
+            inputs[self._state] = _array(
+                observations
+                if isinstance(observations, torch.Tensor)
+                else torch.cat([observations[name] for name in self._flat_groups], dim=-1)
+            )
+        count = len(next(iter(inputs.values())))
+        if not self._memory:
+            self._memory = {
+                name: np.zeros((layers, count, *rest), np.float32)
+                for name, (layers, _, *rest) in self._memory_shapes.items()
+            }
+        if self._is_for_one:
+            rows = [self._run(inputs, slice(row, row + 1)) for row in range(count)]
+            actions, *memories = (
+                np.concatenate(parts, axis=0 if k == 0 else 1)
+                for k, parts in enumerate(zip(*rows, strict=True))
+            )
+        else:
+            actions, *memories = self._run(inputs, slice(None))
+        self._memory = dict(zip(self._memories, memories, strict=True))
+        return torch.from_numpy(actions).to(self.device)
+
+    def reset(self, dones: torch.Tensor | None = None) -> None:
+        """Forget what was seen in environments where `dones` (N,) is not 0; None: in all."""
+        if dones is None:
+            self._memory.clear()
+            return
+        ended = (dones != 0).cpu().numpy()
+        for value in self._memory.values():
+            value[:, ended] = 0.0
+
+    def check_fits(self, env: ManagerBasedRlEnv) -> None:
+        """Refuse an environment with other observations or actions than those of the training.
+
+        Raises:
+            OnnxPolicyError: something differs; the text names all of it.
+        """
+        differences = self._group_differences(env)
+        if not differences:
+            wanted = metadata_texts(get_base_metadata(env, "", self._named_groups))
+            own = {key: self.metadata[key] for key in _INTERFACE if key in self.metadata}
+            own |= {key: self.metadata.get(key, "") for key in _CLOCK}
+            differences = [
+                f"{key}: the policy has {value or 'none'}, the environment {wanted.get(key) or 'none'}"
+                for key, value in own.items()
+                if not _alike(value, wanted.get(key, ""))
+            ]
+        sizes = env.action_manager.total_action_dim
+        if sizes != self.num_actions:
+            differences.append(f"actions: the policy has {self.num_actions}, not {sizes}")
+        if differences:
+            raise OnnxPolicyError(
+                f"The policy {self.path} was trained for another environment. "
+                + "; ".join(differences)
+                + "."
+            )
+
+    def _group_differences(self, env: ManagerBasedRlEnv) -> list[str]:
+        """Return, one text each, the groups of observations that the environment has not."""
+        groups = self._named_groups or []
+        if not groups and not self.image_shapes:
+            return []
+        shapes: dict[str, Any] = env.observation_manager.group_obs_dim
+        differences = [
+            f"observations {name!r}: the environment has no such group"
+            for name in groups
+            if name not in shapes
+        ]
+        for name, shape in self.image_shapes.items():
+            found = tuple(shapes[name]) if name in shapes else "no such group"
+            if found != shape:
+                differences.append(
+                    f"images {name!r}: the policy has {shape}, the environment {found}"
+                )
+        return differences
+
+    def _read_inputs(self, graph: Any) -> None:
+        inputs = {item.name: _dims(item) for item in graph.input}
+        self._memory_shapes = {name: inputs.pop(name) for name in self._memories}
+        flat = [name for name, dims in inputs.items() if len(dims) == 2]
+        self._state = flat[0] if flat else None
+        self.num_observations = inputs[flat[0]][-1] if flat else 0
+        self.image_shapes = {
+            name: tuple(dims[1:]) for name, dims in inputs.items() if len(dims) == 4
+        }
+        batches = [size for dims in inputs.values() for size in dims[:1]]
+        batches += [size for dims in self._memory_shapes.values() for size in dims[1:2]]
+        is_known = len(flat) <= 1 and len(flat) + len(self.image_shapes) == len(inputs) > 0
+        if not is_known or max(batches) > 1:
+            raise OnnxPolicyError(
+                f"The actions of the policy {self.path} depend on the inputs {list(inputs)} of sizes "
+                f"{list(inputs.values())}; one flat input, any number of images and a memory (`h_in` "
+                "with an output `h_out`), for one environment or any number, can be played here. "
+                "Play the checkpoint (model_<iteration>.pt) instead."
+            )
+        # The size of a dynamic dimension reads 0.
+        self._is_for_one = max(batches) == 1
+
+    def _run(self, inputs: dict[str, np.ndarray], rows: slice) -> list[np.ndarray]:
+        """Return the actions and the next memory of some environments."""
+        feed = {name: value[rows] for name, value in inputs.items()}
+        feed |= {name: value[:, rows] for name, value in self._memory.items()}
+        return self._session.run(self._outputs, feed)
 
 
-class _ImagesOnly(torch.nn.Module):
-    """An image model without flat observations, and without the empty input for them."""
+def _read_model(path: Path) -> Any:
+    import onnx
 
-    def __init__(self, model: Any) -> None:
-        super().__init__()
-        self.model = model
-        self.input_names = model.input_names[1:]
-        self.output_names = model.output_names
+    try:
+        model = onnx.load(str(path))
+    except FileNotFoundError as error:
+        raise OnnxPolicyError(f"There is no policy {path}.") from error
+    except Exception as error:
+        raise OnnxPolicyError(
+            f"{path} is not an ONNX file that can be read: {_first_line(error)}"
+        ) from error
+    if not model.graph.node:
+        raise OnnxPolicyError(f"{path} is not an ONNX file that can be read: it has no graph.")
+    # Not refused, because people optimize graphs.
+    written = {item.key: item.value for item in model.metadata_props}.get(DIGEST_KEY)
+    if written is not None and written != initializers_digest(model):
+        logger.warning(
+            "The weights in %s are not those that were exported (%s differs): the file was edited or "
+            "damaged.", path, DIGEST_KEY,
+        )  # fmt: skip
+    return model
 
-    def get_dummy_inputs(self) -> tuple[torch.Tensor, ...]:
-        """Return images of zeros."""
-        return self.model.get_dummy_inputs()[1:]
 
-    def forward(self, *images: torch.Tensor) -> torch.Tensor:
-        """Return the action for one image of each group."""
-        return self.model(images[0].new_zeros(1, 0), *images)
+def _make_session(path: Path, model: Any, num_envs: int) -> Any:
+    """Return a session of onnxruntime with as many threads as the policy is worth."""
+    import onnxruntime
+
+    weights = sum(math.prod(tensor.dims) for tensor in model.graph.initializer)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch_threads(weights, num_envs)
+    # Threads that wait by spinning take the cores of the physics.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # Errors are raised; they need not be printed too.
+    options.log_severity_level = 4
+    try:
+        return onnxruntime.InferenceSession(
+            model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+        )
+    except Exception as error:
+        raise OnnxPolicyError(
+            f"The policy {path} cannot be computed: {_first_line(error)}. The file is damaged, or "
+            "onnxruntime does not know it. Play the checkpoint (model_<iteration>.pt) instead."
+        ) from error
+
+
+def _keep_only(graph: Any, outputs: Sequence[str]) -> None:
+    """Remove from `graph`, in place, everything that `outputs` do not depend on."""
+    needed = set(outputs)
+    # Nodes of a graph are in the order in which they are computed.
+    for index in reversed(range(len(graph.node))):
+        node = graph.node[index]
+        if needed.intersection(node.output):
+            needed.update(node.input)
+        else:
+            del graph.node[index]
+    # Earlier versions of the format list weights among the inputs too.
+    weights = {tensor.name for tensor in graph.initializer}
+    for values, kept in ((graph.initializer, needed), (graph.input, needed - weights)):
+        for index in reversed(range(len(values))):
+            if values[index].name not in kept:
+                del values[index]
+    for index in reversed(range(len(graph.output))):
+        if graph.output[index].name not in outputs:
+            del graph.output[index]
+
+
+def _array(value: torch.Tensor) -> np.ndarray:
+    return value.detach().to("cpu", torch.float32).numpy()
+
+
+def _dims(value: Any) -> list[int]:
+    return [int(dim.dim_value) for dim in value.type.tensor_type.shape.dim]
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [""])[0] or type(error).__name__
+
+
+def _alike(one: str, other: str) -> bool:
+    """Whether two properties say the same: words exactly, numbers nearly."""
+    ours, theirs = one.replace(";", ",").split(","), other.replace(";", ",").split(",")
+    if len(ours) == 1 and len(theirs) > 1:
+        # One number for all components.
+        ours *= len(theirs)
+    return len(ours) == len(theirs) and all(map(_same, ours, theirs))
+
+
+def _same(one: str, other: str) -> bool:
+    try:
+        first, second = float(one), float(other)
+    except ValueError:
+        return one == other
+    return math.isclose(first, second, rel_tol=_RELATIVE_TOLERANCE, abs_tol=_ABSOLUTE_TOLERANCE)

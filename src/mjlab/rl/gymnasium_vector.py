@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from mjlab.envs.manager_based_rl_env import as_action
+from mjlab.utils.errors import WrongStateError, check_one_of, check_positive
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -118,7 +119,13 @@ class GymnasiumVectorEnv(VectorEnv):
                 )
         mask = mask.to(self.device)
         if seed is not None:
-            self._start_over()
+            core = self.env.unwrapped
+            # Loading compares the shapes of observations, and writes into them: not into those that
+            # the caller has.
+            core.reset()
+            if self._first_state is None:
+                self._first_state = copy.deepcopy(core.state_dict())
+            core.load_state_dict(self._first_state)
         self._observations, _ = self.env.reset(seed=seed, env_ids=mask)
         self._returns.masked_fill_(mask, 0.0)
         return self._shown(self._observations), {}
@@ -135,7 +142,7 @@ class GymnasiumVectorEnv(VectorEnv):
         actions = as_action(actions, self.env.unwrapped.device)
         before = self._observations
         if not before:
-            raise RuntimeError(
+            raise WrongStateError(
                 "step: expected an environment that was reset, got a new one; call reset."
             )
         lengths = self.env.unwrapped.episode_length_buf.clone()
@@ -147,17 +154,8 @@ class GymnasiumVectorEnv(VectorEnv):
         if self._resets and ended.any():
             self._add_ends(infos, ended, lengths + 1, before, extras)
             self._returns.masked_fill_(ended, 0.0)
-        rewards, terminated, truncated = map(self._array, (rewards, terminated, truncated))
+        rewards, terminated, truncated = map(self._arrays, (rewards, terminated, truncated))
         return self._shown(self._observations), rewards, terminated, truncated, infos
-
-    def _start_over(self) -> None:
-        core = self.env.unwrapped
-        # Loading compares the shapes of observations, and writes into them: not into those that the
-        # caller has.
-        core.reset()
-        if self._first_state is None:
-            self._first_state = copy.deepcopy(core.state_dict())
-        core.load_state_dict(self._first_state)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return the image of the view of all environments, as a tuple of one; None without a render mode."""
@@ -191,14 +189,14 @@ class GymnasiumVectorEnv(VectorEnv):
             shown = self._shown(_row(before, diverged))
             for position, row in enumerate(diverged.tolist()):
                 final[row] = _row(shown, position)
-        mask = self._array(ended)
+        mask = self._arrays(ended)
         infos |= {
             "final_obs": final,
             "_final_obs": mask,
             "final_info": {
-                "episode_return": self._array(torch.where(ended, self._returns, 0.0)),
+                "episode_return": self._arrays(torch.where(ended, self._returns, 0.0)),
                 "_episode_return": mask,
-                "episode_length": self._array(torch.where(ended, lengths, 0)),
+                "episode_length": self._arrays(torch.where(ended, lengths, 0)),
                 "_episode_length": mask,
             },
             "_final_info": mask,
@@ -206,17 +204,12 @@ class GymnasiumVectorEnv(VectorEnv):
 
     def _shown(self, observations: dict[str, Any]) -> Any:
         """Return observations as they are given to the caller: those of the group, as arrays."""
-        if self._group is not None:
-            return self._arrays(observations[self._group])
-        return self._arrays(observations)
+        return self._arrays(observations if self._group is None else observations[self._group])
 
     def _arrays(self, values: Any) -> Any:
         if isinstance(values, dict):
             return {name: self._arrays(value) for name, value in values.items()}
-        return self._array(values)
-
-    def _array(self, value: torch.Tensor) -> Any:
-        return value if self._tensors else value.cpu().numpy()
+        return values if self._tensors else values.cpu().numpy()
 
 
 def step_env(
@@ -262,8 +255,7 @@ def observation_space(env: ManagerBasedRlEnv, group: str | None = None) -> gymna
     names = list(manager.active_terms)
     if group is None:
         return gymnasium.spaces.Dict({name: _group_space(manager, name) for name in names})
-    if group not in names:
-        raise ValueError(f"group: expected one of {names}, got {group!r}.")
+    check_one_of("group", group, names)
     return _group_space(manager, group)
 
 
@@ -273,8 +265,8 @@ def action_space(env: ManagerBasedRlEnv, limit: float | None = None) -> gymnasiu
     Raises:
         ValueError: `limit` is not positive.
     """
-    if limit is not None and not limit > 0:
-        raise ValueError(f"clip_actions: expected a positive number or None, got {limit}.")
+    if limit is not None:
+        check_positive("clip_actions", limit)
     bound = np.inf if limit is None else limit
     shape = (env.action_manager.total_action_dim,)
     return gymnasium.spaces.Box(-bound, bound, shape, np.float32)

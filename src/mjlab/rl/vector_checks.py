@@ -153,7 +153,13 @@ class _Check:
         elif "final_obs" in infos:
             self.fault("final_obs", f"expected none with {self._mode}, got infos['final_obs']")
         if self._mode is AutoresetMode.NEXT_STEP:
-            self._check_next_step(rewards, ended, ended_before)
+            # A step after the end of an episode only resets.
+            if (rewards[ended_before] != 0).any():
+                self.fault(
+                    "autoreset", "expected reward 0 in the step after an end, which only resets"
+                )
+            if (ended & ended_before).any():
+                self.fault("autoreset", "an episode ends in the step that only resets")
         return self._copies
 
     def _rows(self, observations: Any) -> list[Any]:
@@ -265,13 +271,6 @@ class _Check:
                 return
             self._stale.see(terminated[row], _same(final[row], before[row]))
             self._unreset.see(terminated[row], _same(final[row], after[row]))
-
-    def _check_next_step(self, rewards: np.ndarray, ended: np.ndarray, before: np.ndarray) -> None:
-        """Check that a step after the end of an episode only resets."""
-        if (rewards[before] != 0).any():
-            self.fault("autoreset", "expected reward 0 in the step after an end, which only resets")
-        if (ended & before).any():
-            self.fault("autoreset", "an episode ends in the step that only resets")
 
 
 class _Always:

@@ -264,7 +264,7 @@ def load_policy(
         CheckpointError: the file is missing, damaged, or holds another network.
     """
     if checkpoint.suffix == ".onnx":
-        from mjlab.rl.onnx_policy import load_onnx_policy
+        from mjlab.rl.exporter_utils import load_onnx_policy
 
         return load_onnx_policy(checkpoint, env, device)
     from mjlab.rl import MjlabOnPolicyRunner

@@ -11,7 +11,7 @@ from tracking_tasks import G1, G1_BLIND
 
 from mjlab.envs import mdp
 from mjlab.managers import ObservationTermCfg
-from mjlab.rl.onnx_policy import load_onnx_policy
+from mjlab.rl.exporter_utils import load_onnx_policy
 from mjlab.tasks.tracking.rl.reference_actor import ReferenceActor
 
 ACTOR = "mjlab.tasks.tracking.rl.reference_actor:ReferenceActor"

@@ -14,8 +14,13 @@ from velocity_tasks import task_cfg
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import ObservationTermCfg, RewardTermCfg, SceneEntityCfg
-from mjlab.rl.exporter_utils import attach_metadata_to_onnx, get_base_metadata, metadata_texts
-from mjlab.rl.onnx_policy import OnnxPolicy, OnnxPolicyError
+from mjlab.rl.exporter_utils import (
+    OnnxPolicy,
+    OnnxPolicyError,
+    attach_metadata_to_onnx,
+    get_base_metadata,
+    metadata_texts,
+)
 from mjlab.tasks.velocity import mdp
 from mjlab.tasks.velocity.gait_figures import GAIT_FIGURES
 from mjlab.tasks.velocity.symmetry import mirror_left_right

@@ -12,7 +12,7 @@ import torch
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
 from mjlab.rl.evaluation import evaluate_policy
-from mjlab.rl.onnx_policy import load_onnx_policy
+from mjlab.rl.exporter_utils import load_onnx_policy
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 
 TASK = "Mjlab-Velocity-Flat-Unitree-Go1"

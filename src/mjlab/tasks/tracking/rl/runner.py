@@ -39,10 +39,10 @@ class PolicyWithReference(torch.nn.Module):
 
     | input | shape | | output | shape |
     | --- | --- | --- | --- | --- |
-    | `obs` | (1, observations) | | `actions` | (1, nj), the mean; the normalizer is inside |
-    | `time_step` | (1, 1) | | `joint_pos`, `joint_vel` | (1, nj) |
-    | | | | `body_pos_w`, `body_lin_vel_w`, `body_ang_vel_w` | (1, K, 3) |
-    | | | | `body_quat_w` | (1, K, 4) |
+    | `obs` | (N, observations) | | `actions` | (N, nj), the mean; the normalizer is inside |
+    | `time_step` | (N, 1) | | `joint_pos`, `joint_vel` | (N, nj) |
+    | | | | `body_pos_w`, `body_lin_vel_w`, `body_ang_vel_w` | (N, K, 3) |
+    | | | | `body_quat_w` | (N, K, 4) |
 
     The time step is a number of frames, truncated to an integer and kept within the reference; it
     counts over all motions, one after the other. Bodies are the tracked ones, without origins of

@@ -1,4 +1,4 @@
-"""Playing exported policies without an ONNX runtime."""
+"""Playing exported policies in any number of environments."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from onnx import TensorProto, helper
 
 from mjlab.rl.exporter_utils import (
     DIGEST_KEY,
+    OnnxPolicy,
+    OnnxPolicyError,
+    _alike,
     attach_metadata_to_onnx,
     export_to_onnx,
     initializers_digest,
+    load_onnx_policy,
 )
-from mjlab.rl.onnx_policy import OnnxPolicy, OnnxPolicyError, _alike, load_onnx_policy
 from mjlab.rl.rsl import RNNModel, TensorDict
 
 ACTIVATIONS = {
@@ -37,7 +40,7 @@ ACTIVATIONS = {
 
 
 class Exported(torch.nn.Module):
-    """What rsl_rl's `as_onnx` gives: a normalizer and a network, for one observation."""
+    """What rsl_rl's `as_onnx` gives: a normalizer and a network."""
 
     input_names, output_names = ("obs",), ("actions",)
 
@@ -67,22 +70,36 @@ def export(path: Path, activation: str = "elu", **metadata: str) -> Path:
     return path
 
 
+def with_batch_of_one(path: Path) -> Path:
+    """Give the file a fixed batch size of 1, which exports had before they took any."""
+    model = onnx.load(str(path))
+    for value in (*model.graph.input, *model.graph.output):
+        for dim in value.type.tensor_type.shape.dim:
+            if dim.dim_param == "batch":
+                dim.dim_value = 1
+    onnx.save(model, str(path))
+    return path
+
+
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_it_computes_what_onnxruntime_does(tmp_path: Path, activation: str) -> None:
+def test_it_computes_what_torch_does(tmp_path: Path, activation: str) -> None:
     path = export(tmp_path / "policy.onnx", activation)
+    rows = 3.0 * torch.randn(6, 5, generator=torch.Generator().manual_seed(0))
+    with torch.inference_mode():
+        expected = Exported(ACTIVATIONS[activation])(rows)
     policy = OnnxPolicy(path)
-    session = onnxruntime.InferenceSession(str(path))
-    rows = 3.0 * np.random.default_rng(0).standard_normal((6, 5)).astype(np.float32)
-    expected = [session.run(None, {"obs": row[None]})[0][0] for row in rows]
-    # All rows at once, although the file is made for one.
-    np.testing.assert_allclose(policy(torch.from_numpy(rows)), expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(policy(rows), expected, rtol=1e-4, atol=1e-5)
     assert (policy.num_observations, policy.num_actions) == (5, 3)
+    earlier = OnnxPolicy(with_batch_of_one(path))
+    torch.testing.assert_close(earlier(rows), expected, rtol=1e-4, atol=1e-5)
+    assert (earlier.num_observations, earlier.num_actions) == (5, 3)
 
 
+@pytest.mark.parametrize("is_fixed", [False, True])
 @pytest.mark.parametrize("layers", [1, 2])
 @pytest.mark.parametrize("kind", ["lstm", "gru"])
 def test_memory_is_kept_for_each_environment_and_forgotten_at_the_end_of_its_episode(
-    tmp_path: Path, kind: str, layers: int
+    tmp_path: Path, kind: str, layers: int, is_fixed: bool
 ) -> None:
     torch.manual_seed(1)
     observations = TensorDict({"actor": torch.zeros(3, 5)}, batch_size=[3])
@@ -91,6 +108,8 @@ def test_memory_is_kept_for_each_environment_and_forgotten_at_the_end_of_its_epi
         rnn_num_layers=layers,
     )  # fmt: skip
     export_to_onnx(model.as_onnx(), tmp_path / "p.onnx")
+    if is_fixed:
+        with_batch_of_one(tmp_path / "p.onnx")
     policy = OnnxPolicy(tmp_path / "p.onnx")
     session = onnxruntime.InferenceSession(str(tmp_path / "p.onnx"))
     memories = [item.name for item in session.get_inputs()][1:]
@@ -152,19 +171,27 @@ def test_what_is_no_policy_is_refused_with_the_reason(tmp_path: Path) -> None:
         OnnxPolicy(tmp_path / "empty.onnx")
 
 
-def graph(path: Path, nodes: list, inputs: list[str], outputs: list[str]) -> Path:
+def graph(
+    path: Path, nodes: list, inputs: list[str], outputs: list[str], batch: int | str = 1
+) -> Path:
     def values(names: list[str]) -> list:
-        return [helper.make_tensor_value_info(n, TensorProto.FLOAT, [1, 2]) for n in names]
+        return [helper.make_tensor_value_info(n, TensorProto.FLOAT, [batch, 2]) for n in names]
 
     made = helper.make_graph(nodes, "policy", values(inputs), values(outputs))
     onnx.save(helper.make_model(made), str(path))
     return path
 
 
-def test_operators_and_inputs_that_are_not_known_are_named(tmp_path: Path) -> None:
-    rnn = graph(tmp_path / "r.onnx", [helper.make_node("RNN", ["x"], ["y"])], ["x"], ["y"])
-    with pytest.raises(OnnxPolicyError, match=r"operator RNN.*Gemm.*Play the checkpoint"):
-        OnnxPolicy(rnn)
+def test_what_onnxruntime_does_not_compute_is_told_in_one_line(tmp_path: Path, capfd) -> None:
+    nodes = [helper.make_node("Rumble", ["x"], ["y"])]
+    path = graph(tmp_path / "r.onnx", nodes, ["x"], ["y"])
+    with pytest.raises(OnnxPolicyError, match=r"r\.onnx.*Rumble.*[Pp]lay the checkpoint") as caught:
+        OnnxPolicy(path)
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr().err == ""
+
+
+def test_inputs_and_outputs_that_are_not_known_are_named(tmp_path: Path) -> None:
     two = graph(
         tmp_path / "2.onnx", [helper.make_node("Add", ["x", "h"], ["y"])], ["x", "h"], ["y"]
     )
@@ -174,12 +201,15 @@ def test_operators_and_inputs_that_are_not_known_are_named(tmp_path: Path) -> No
     several = graph(tmp_path / "s.onnx", nodes, ["x"], ["y", "z"])
     with pytest.raises(OnnxPolicyError, match=r"outputs \['y', 'z'\], of which none is called 'a"):
         OnnxPolicy(several)
+    four = graph(tmp_path / "4.onnx", [helper.make_node("Relu", ["x"], ["y"])], ["x"], ["y"], 4)
+    with pytest.raises(OnnxPolicyError, match=r"\['x'\] of sizes \[\[4, 2\]\]"):
+        OnnxPolicy(four)
 
 
 def test_only_what_the_actions_follow_from_is_computed(tmp_path: Path) -> None:
     """Such as in files of motion tracking, which return the reference at another input."""
     nodes = [
-        helper.make_node("LSTM", ["time_step"], ["frame"]),
+        helper.make_node("Exp", ["time_step"], ["frame"]),
         helper.make_node("Relu", ["obs"], ["h"]),
         helper.make_node("Neg", ["frame"], ["joint_pos"]),
         helper.make_node("Tanh", ["h"], ["actions"]),
@@ -210,14 +240,14 @@ def test_an_environment_with_other_observations_or_actions_is_refused(
         tmp_path / "p.onnx", observation_names="speed,angle", step_dt="0.02", action_scale="0.5"
     )
     monkeypatch.setattr(
-        "mjlab.rl.onnx_policy.get_base_metadata",
+        "mjlab.rl.exporter_utils.get_base_metadata",
         lambda env, run, groups: {
             "observation_names": ["speed", "height"],
             "step_dt": 0.02,
             "action_scale": 0.25,
         },
     )
-    env = SimpleNamespace(action_manager=SimpleNamespace(total_action_dim=4))
+    env = SimpleNamespace(num_envs=2, action_manager=SimpleNamespace(total_action_dim=4))
     with pytest.raises(OnnxPolicyError) as caught:
         load_onnx_policy(path, SimpleNamespace(unwrapped=env), "cpu")
     message = str(caught.value)
