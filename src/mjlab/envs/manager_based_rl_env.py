@@ -182,7 +182,7 @@ def as_action(action: Any, device: str) -> torch.Tensor:
         TypeError: it is a tensor of complex numbers, or without data.
     """
     if isinstance(action, torch.Tensor):
-        check_real("The action", action)
+        check_real(action, str, "The action")
         return action.to(device)
     try:
         # Copied, because torch warns about arrays that it may not write to.
