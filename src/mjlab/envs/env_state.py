@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.managers.manager_base import NullManager
 from mjlab.utils.state import capture_state, restore_state, shape_differences
 
 if TYPE_CHECKING:
@@ -125,8 +126,7 @@ def _terms(env: ManagerBasedRlEnv) -> dict[str, Any]:
 
 
 def _managers(env: ManagerBasedRlEnv) -> list[str]:
-    # Null managers have no state and are not marked stateful.
-    return [name for name in _MANAGERS if not type(getattr(env, name)).__name__.startswith("Null")]
+    return [name for name in _MANAGERS if not isinstance(getattr(env, name), NullManager)]
 
 
 def _cloned(observations: dict[str, Any]) -> dict[str, Any]:

@@ -357,6 +357,10 @@ class NullManager:
         super().__init__({}, SimpleNamespace(num_envs=0, device="cpu"))  # ty: ignore
         self.cfg = None
 
+    def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
+        """Return no terms."""
+        return []
+
 
 @contextlib.contextmanager
 def label_errors(label: str) -> Generator[None]:

@@ -15,6 +15,7 @@ Messages read "<owner> <field>: expected X, got Y; use Z."
 from __future__ import annotations
 
 from collections.abc import Iterable
+from numbers import Integral
 from typing import Any
 
 from mjlab.utils.string import suggest
@@ -63,7 +64,7 @@ def check_positive(name: str, value: float) -> None:
 
 def check_count(name: str, value: Any, minimum: int = 1) -> None:
     """Raise `ValueError` unless `value` is an integer >= `minimum`."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < minimum:
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < minimum:
         raise ValueError(f"{name}: expected an integer >= {minimum}, got {value!r}.")
 
 
