@@ -76,7 +76,22 @@ class EventManager(TermFunctionSwitches, TermListManager):
         self._last_reset_step: dict[str, torch.Tensor] = {}
         for name, term in zip(self._term_names, self._term_cfgs, strict=True):
             self._terms_by_mode.setdefault(term.mode, []).append((name, term))
-            self._prepare_time(name, term)
+            if term.mode == "reset":
+                never = torch.full((self.num_envs,), _NEVER, dtype=torch.long, device=self.device)
+                self._last_reset_step[name] = never
+            bounds = term.interval_range_s
+            is_missing = bounds is None and term.mode == "interval"
+            if is_missing or (bounds is not None and not (is_interval(bounds) and bounds[0] >= 0)):
+                raise ValueError(
+                    f"{self._label(name)} interval_range_s: expected (shortest, longest) in "
+                    f"seconds, with 0 <= shortest <= longest, got {bounds!r}."
+                )
+            if term.mode == "interval":
+                self._lookups[name] = Lookup()
+                is_global = term.is_global_time
+                self._timers[name] = (
+                    self._draw_global(term) if is_global else self._draw(term, self.num_envs)
+                )
 
     @property
     def active_terms(self) -> dict[str, list[str]]:  # ty: ignore[incompatible-property-override]
@@ -201,42 +216,16 @@ class EventManager(TermFunctionSwitches, TermListManager):
             if isinstance(cfg, EventTermCfg):
                 check_one_of(f"{self._label(name)} mode", cfg.mode, get_args(EventMode))
         super()._prepare_terms()
-
-    def _resolve_params(self, name: str, cfg: ManagerTermBaseCfg) -> None:
-        """Resolve selections, and tell of those that are explicitly empty.
-
-        An empty selection is allowed and changes nothing. Where it was forgotten rather than
-        meant, nobody would notice otherwise.
-        """
-        super()._resolve_params(name, cfg)
-        for key, value in cfg.params.items():
-            if not isinstance(value, SceneEntityCfg):
-                continue
-            for attribute in value.empty_selections():
-                logger.warning(
-                    "%s, parameter %r: %s of entity %r is empty, so the event changes nothing "
-                    "there. Name what it is for, or set the term to None.",
-                    *(self._label(name), key, attribute, value.name),
-                )
-
-    def _prepare_time(self, name: str, cfg: EventTermCfg) -> None:
-        if cfg.mode == "reset":
-            self._last_reset_step[name] = torch.full(
-                (self.num_envs,), _NEVER, dtype=torch.long, device=self.device
-            )
-        bounds = cfg.interval_range_s
-        is_missing = bounds is None and cfg.mode == "interval"
-        if is_missing or (bounds is not None and not (is_interval(bounds) and bounds[0] >= 0)):
-            raise ValueError(
-                f"{self._label(name)} interval_range_s: expected (shortest, longest) in seconds, "
-                f"with 0 <= shortest <= longest, got {bounds!r}."
-            )
-        if cfg.mode != "interval":
-            return
-        self._lookups[name] = Lookup()
-        self._timers[name] = (
-            self._draw_global(cfg) if cfg.is_global_time else self._draw(cfg, self.num_envs)
-        )
+        for name, cfg in zip(self._term_names, self._term_cfgs, strict=True):
+            for key, value in cfg.params.items():
+                # An empty selection is allowed and changes nothing. Where it was forgotten rather
+                # than meant, nobody would notice otherwise.
+                for field in value.empty_selections() if isinstance(value, SceneEntityCfg) else ():
+                    logger.warning(
+                        "%s, parameter %r: %s of entity %r is empty, so the event changes nothing "
+                        "there. Name what it is for, or set the term to None.",
+                        *(self._label(name), key, field, value.name),
+                    )
 
     def _draw(self, cfg: EventTermCfg, count: int, device: str | None = None) -> torch.Tensor:
         low, high = cfg.interval_range_s or (0.0, 0.0)

@@ -223,7 +223,19 @@ class ManagerBase(ABC):
                 raise WrongTypeError(
                     f"{self._label(name)}: {type(cfg.func).__name__} has no __call__."
                 )
-        self._check_parameters(name, cfg, leading)
+        try:
+            signature = inspect.signature(cfg.func)
+        except (ValueError, TypeError):
+            signature = None
+        if signature is not None:
+            try:
+                signature.bind(*leading, **cfg.params)
+            except TypeError as error:
+                function = getattr(cfg.func, "__qualname__", type(cfg.func).__name__)
+                raise WrongTypeError(
+                    f"{self._label(name)}: {function}{signature} cannot be called with "
+                    f"({', '.join(leading)}) and the parameters {list(cfg.params)}: {error}."
+                ) from error
         with label_errors(self._label(name)):
             check_term(cfg.func, self._env, cfg.params)
         if not inspect.isroutine(cfg.func):
@@ -232,21 +244,6 @@ class ManagerBase(ABC):
             with contextlib.suppress(TypeError):
                 stateful(type(cfg.func))
             self._class_terms[name] = cfg.func
-
-    def _check_parameters(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
-        """Raise TypeError now if calling the term would, because its parameters do not fit."""
-        try:
-            signature = inspect.signature(cfg.func)
-        except (ValueError, TypeError):
-            return
-        try:
-            signature.bind(*leading, **cfg.params)
-        except TypeError as error:
-            function = getattr(cfg.func, "__qualname__", type(cfg.func).__name__)
-            raise WrongTypeError(
-                f"{self._label(name)}: {function}{signature} cannot be called with "
-                f"({', '.join(leading)}) and the parameters {list(cfg.params)}: {error}."
-            ) from error
 
     def _reset_class_terms(self, env_ids: EnvIds) -> None:
         for term in self._class_terms.values():
@@ -282,6 +279,8 @@ class TermListManager(ManagerBase):
     _transient = {"_term_cfgs"}
     _cfg_type: type[ManagerTermBaseCfg] = ManagerTermBaseCfg
     _leading: Sequence[str] = ("env",)
+    # Fields of a term's config that the printed table shows.
+    _shown: Sequence[str] = ()
 
     def __init__(self, cfg: Mapping[str, Any], env: ManagerBasedRlEnv) -> None:
         # Terms are copied one by one, so that one config used twice becomes two terms.
@@ -303,6 +302,14 @@ class TermListManager(ManagerBase):
 
     def _live_cfgs(self) -> dict[str, Any]:
         return dict(zip(self._term_names, self._term_cfgs, strict=True))
+
+    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
+        header = ["name", *(field.replace("_", " ") for field in self._shown)]
+        rows = [
+            (name, *(getattr(cfg, field) for field in self._shown))
+            for name, cfg in self._live_cfgs().items()
+        ]
+        return header, rows
 
     def _prepare_terms(self) -> None:
         self._term_names: list[str] = []

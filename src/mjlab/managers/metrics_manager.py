@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 
@@ -39,6 +39,7 @@ class MetricsManager(TermListManager):
     """
 
     _cfg_type = MetricsTermCfg
+    _shown = ("reduce", "per_substep")
     _transient = {"_rows", "_substep_rows", "_terms_by_reduce", "excluded"}
 
     def __init__(self, cfg: Mapping[str, MetricsTermCfg | None], env: ManagerBasedRlEnv) -> None:
@@ -132,11 +133,6 @@ class MetricsManager(TermListManager):
         value = cfg.func(self._env, **cfg.params)
         self._check_value(self._term_names[k], value)
         return value
-
-    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
-        terms = zip(self._term_names, self._term_cfgs, strict=True)
-        rows = [(name, cfg.reduce, cfg.per_substep) for name, cfg in terms]
-        return ["name", "reduce", "per substep"], rows
 
 
 class NullMetricsManager(NullManager, MetricsManager):

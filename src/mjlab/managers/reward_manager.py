@@ -47,6 +47,7 @@ class RewardManager(TermFunctionSwitches, TermListManager):
     """
 
     _cfg_type = RewardTermCfg
+    _shown = ("weight",)
     # Views of `_rates`.
     _transient = {"_step_reward", "_rows", "_scale_by_dt", "nonfinite"}
 
@@ -167,7 +168,3 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         """Return, for one environment, the weighted rate of each term in the last step."""
         rates = self._step_reward[env_idx].tolist()
         return [(name, [rate]) for name, rate in zip(self._term_names, rates, strict=True)]
-
-    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
-        terms = zip(self._term_names, self._term_cfgs, strict=True)
-        return ["name", "weight"], [(name, cfg.weight) for name, cfg in terms]

@@ -35,6 +35,7 @@ class TerminationManager(TermListManager):
     """Decides which episodes end. All results are buffers that the next step overwrites."""
 
     _cfg_type = TerminationTermCfg
+    _shown = ("time_out",)
     _transient = {"_rows", "_numeric", "nonfinite"}
 
     def __init__(
@@ -121,7 +122,3 @@ class TerminationManager(TermListManager):
         """Return, for one environment, 1 for each term that was true in the last step, else 0."""
         values = self._values[:, env_idx].tolist()
         return [(name, [float(v)]) for name, v in zip(self._term_names, values, strict=True)]
-
-    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
-        terms = zip(self._term_names, self._term_cfgs, strict=True)
-        return ["name", "time out"], [(name, cfg.time_out) for name, cfg in terms]
