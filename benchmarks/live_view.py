@@ -31,8 +31,9 @@ from websockets.sync.client import connect
 
 from mjlab.rl.config import EvaluationCfg
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
-from mjlab.scripts import train_run
+from mjlab.scripts import environments
 from mjlab.scripts.live import LiveView
+from mjlab.scripts.train import TrainConfig, launch_training
 from mjlab.tasks.registry import load_runner_cls
 
 TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
@@ -110,13 +111,13 @@ def figures(minutes: float) -> dict[str, float]:
             self.observers.append(recorders[0])
             super().learn(*args, **kwargs)
 
-    train_run.load_runner_cls = lambda _: Runner  # ty: ignore[invalid-assignment]
+    environments.load_runner_cls = lambda _: Runner  # ty: ignore[invalid-assignment]
     with tempfile.TemporaryDirectory() as folder:
-        cfg = train_run.TrainConfig.from_task(TASK, "cpu")
+        cfg = TrainConfig.from_task(TASK, "cpu")
         cfg.live, cfg.live_port, cfg.device, cfg.log_root = True, 8790, "cpu", folder
         cfg.agent.max_iterations = 1_000_000
         cfg.agent.evaluation = EvaluationCfg()
-        train_run.launch_training(TASK, cfg)
+        launch_training(TASK, cfg)
     return summary(recorders[0].rows)
 
 

@@ -38,7 +38,7 @@ from report import processor  # noqa: E402
 from solving import EVALUATION_SEED  # noqa: E402
 
 from mjlab.rl.plot import plot_curves  # noqa: E402
-from mjlab.scripts.cli import UserError, resolve_device  # noqa: E402
+from mjlab.scripts.devices import resolve_device  # noqa: E402
 from mjlab.scripts.reference import (  # noqa: E402
     DATA,
     ENDED,
@@ -55,6 +55,7 @@ from mjlab.scripts.reference import (  # noqa: E402
 from mjlab.scripts.run_folder import checkpoints_in  # noqa: E402
 from mjlab.scripts.train_seeds import run_forwarding_signals  # noqa: E402
 from mjlab.tasks.registry import UnknownTaskError, list_profiles, list_tasks, require_task  # noqa: E402
+from mjlab.utils.errors import UserError  # noqa: E402
 from mjlab.utils.processes import available_cores  # noqa: E402
 
 PAGES = ROOT / "docs" / "reference"

@@ -11,7 +11,6 @@ from typing import Any
 from sphinx.application import Sphinx
 from sphinx.ext.napoleon import Config, GoogleDocstring
 
-from mjlab.envs.mdp.dr._table import TABLE
 from mjlab.tasks.velocity import mdp as velocity_mdp
 
 _ROOT = Path(__file__).resolve().parents[1]
@@ -73,13 +72,12 @@ def _inline(text: str) -> str:
 def _readable(
     app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str, returns: str
 ) -> tuple[str, str | None] | None:
-    """Shorten the signatures of configs, and complete those of functions made from a table."""
+    """Shorten the signatures of configs, and complete those of `field_term`."""
     if what == "class" and dataclasses.is_dataclass(obj):
         # The fields are listed below, with their meanings.
         return "", None
     if signature and "row.operation" in signature:
-        operation = TABLE[name.rpartition(".")[2]].operation
-        return signature.replace("row.operation", repr(operation)), returns
+        return signature.replace("row.operation", repr(obj.row.operation)), returns
     return None
 
 

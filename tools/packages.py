@@ -226,7 +226,7 @@ class _Worker:
 
         from mjlab.envs import ManagerBasedRlEnv
         from mjlab.scripts.run_folder import checkpoints_in
-        from mjlab.scripts.train_run import TrainConfig, launch_training
+        from mjlab.scripts.train import TrainConfig, launch_training
         from mjlab.tasks.registry import load_env_cfg
 
         envs = []

@@ -22,7 +22,7 @@ from report import Row
 from gpu_parts.options import Options
 from gpu_parts.tasks import GO1_FLAT
 from mjlab.rl.evaluation import EvaluationResult
-from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
+from mjlab.scripts.evaluate import EvaluateConfig, run_evaluate
 from mjlab.scripts.policy import parse_policy_flags
 from mjlab.tasks.registry import load_rl_cfg
 
@@ -116,5 +116,5 @@ def _is_solved(result: EvaluationResult) -> bool:
 
 
 def _shown(result: EvaluationResult) -> str:
-    errors = ", ".join(f"{name} {result.figure(name):.3f}" for name in _conditions())
+    errors = ", ".join(f"{name} {result.value(name):.3f}" for name in _conditions())
     return f"{errors}; return {result.mean_return:.0f}"

@@ -37,10 +37,10 @@ _KEPT = 1 << 20
 # What commands import late; forked processes should have it.
 _IMPORTS = (
     "mjlab.envs", "mjlab.rl", "mjlab.rl.evaluation", "mjlab.rl.onnx_policy", "mjlab.rl.plot",
-    "mjlab.rl.run_logger", "mjlab.rl.sac", "mjlab.scripts.demo", "mjlab.scripts.display",
-    "mjlab.scripts.evaluate_run", "mjlab.scripts.export_scene_run", "mjlab.scripts.play_run",
-    "mjlab.scripts.profile_env_run", "mjlab.scripts.resume", "mjlab.scripts.train_run",
-    "mjlab.scripts.verify", "mjlab.scripts.viz_nan_run", "mjlab.sim.native.engine",
+    "mjlab.rl.run_logger", "mjlab.rl.sac", "mjlab.scripts.play", "mjlab.scripts.display",
+    "mjlab.scripts.evaluate", "mjlab.scripts.export_scene", "mjlab.scripts.play",
+    "mjlab.scripts.profile_env", "mjlab.scripts.resume", "mjlab.scripts.train",
+    "mjlab.scripts.verify", "mjlab.scripts.viz_nan", "mjlab.sim.native.engine",
     "mjlab.tasks.cartpole.cartpole_env_cfg", "mjlab.viewer.base", "matplotlib.figure",
     "matplotlib.backends.backend_agg", "onnx", "tensorboard.backend.event_processing",
     "tensorboard.backend.event_processing.event_accumulator", "torch.utils.tensorboard", "tyro",

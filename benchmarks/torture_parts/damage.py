@@ -72,8 +72,8 @@ def _read_dump(path: Path) -> Any:
     import mujoco
     import numpy as np
 
-    from mjlab.scripts.cli import UserError
-    from mjlab.scripts.viz_nan_run import load_dump
+    from mjlab.scripts.viz_nan import load_dump
+    from mjlab.utils.errors import UserError
 
     try:
         dump, model = load_dump(str(path))

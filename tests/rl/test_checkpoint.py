@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 
-from mjlab.rl import checkpoint
 from mjlab.rl.checkpoint import (
     CheckpointError,
     RunFolderError,
@@ -45,7 +44,7 @@ def test_a_failing_save_leaves_the_previous_file_and_nothing_else(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     if failing == "write":
-        monkeypatch.setattr(checkpoint, "_write", fail)
+        monkeypatch.setattr(torch, "save", fail)
     else:
         monkeypatch.setattr(os, failing, fail)
     with pytest.raises(CheckpointError, match="disk is full") as caught:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
@@ -232,14 +233,14 @@ def test_a_process_that_ignores_hangups_trains_on(make_runner, tmp_path: Path):
     assert runner.stop_reason == "finished"
 
 
-@pytest.mark.parametrize("place", ["term", "update", "report"])
+@pytest.mark.parametrize("place", ["term", "update", "observer"])
 def test_an_error_leaves_what_was_learned_before_it(
     make_runner, tmp_path: Path, monkeypatch, caplog, place
 ):
     straight = make_runner(tmp_path / "straight", save_interval=100)
     straight.learn(3)
     runner = make_runner(tmp_path / "run", save_interval=100)
-    update, step, report = runner.alg.update, runner.env.step, runner._report
+    update, step = runner.alg.update, runner.env.step
 
     def broken_update():
         losses = update()
@@ -252,13 +253,13 @@ def test_an_error_leaves_what_was_learned_before_it(
             raise ZeroDivisionError("in a term")
         return step(actions)
 
-    def broken_report(iteration, *args):
-        if iteration == 3:
-            raise ZeroDivisionError("in an observer")
-        return report(iteration, *args)
+    class Broken(TrainingObserver):
+        def on_iteration(self, stats: IterationStats) -> None:
+            if stats.iteration == 4:
+                raise ZeroDivisionError("in an observer")
 
-    if place == "report":
-        monkeypatch.setattr(runner, "_report", broken_report)
+    if place == "observer":
+        runner.observers.append(Broken())
     elif place == "update":
         monkeypatch.setattr(runner.alg, "update", broken_update)
     else:
@@ -501,11 +502,15 @@ def test_a_full_disk_keeps_the_last_checkpoint(make_runner, tmp_path: Path, monk
     runner.learn(1)
     before = (tmp_path / "run" / "model_0.pt").read_bytes()
 
-    def fail(data, file):
-        file.write(b"half of it")
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    replacing = checkpoint.replacing
 
-    monkeypatch.setattr(checkpoint, "_write", fail)
+    @contextlib.contextmanager
+    def fail(path, **kwargs):
+        with replacing(path, **kwargs) as file:
+            yield file
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(checkpoint, "replacing", fail)
     with pytest.raises(CheckpointError, match="disk is full.*model_0.pt.*is intact"):
         runner.learn(3)
     assert (tmp_path / "run" / "model_0.pt").read_bytes() == before

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +20,7 @@ import pytest
 import torch
 
 from mjlab.rl.run_logger import IterationStats
-from mjlab.scripts import train_run
+from mjlab.scripts import cli, display
 from mjlab.scripts.run_folder import checkpoints_in, read_run_info
 
 TASK = "Mjlab-Cartpole-Swingup"
@@ -64,11 +64,16 @@ def _kept_process_settings() -> Iterator[None]:
 
 
 def run_script(script: str, *argv: str) -> Outcome:
-    """Run `script` (a module of mjlab.scripts) with `argv`, as the command line does."""
-    main = importlib.import_module(f"mjlab.scripts.{script}").main
+    """Run `script` (a command, or a module of mjlab.scripts) with `argv`, as the command line does."""
+    main = getattr(cli, script, None) or importlib.import_module(f"mjlab.scripts.{script}").main
+    return run_main(main, script, *argv)
+
+
+def run_main(main: Callable[[], None], name: str, *argv: str) -> Outcome:
+    """Call the entry point `main` as the command `name` with `argv`."""
     out, err = io.StringIO(), io.StringIO()
     before = sys.argv
-    sys.argv = [script, *argv]
+    sys.argv = [name, *argv]
     try:
         with (
             _kept_process_settings(),
@@ -95,7 +100,7 @@ def stopped_after(iterations: int) -> Iterator[None]:
             signal.raise_signal(signal.SIGINT)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train_run._Beginning, "on_iteration", stop)
+        patch.setattr(display.KeepRunFolder, "on_iteration", stop)
         yield
 
 

@@ -11,12 +11,19 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 from commands import SMALL, TASK, Outcome, run_script
+from commands import run_main as run_entry_point
 
 
 @pytest.fixture(scope="session")
 def run() -> Callable[..., Outcome]:
     """Return a function that runs a command."""
     return run_script
+
+
+@pytest.fixture(scope="session")
+def run_main() -> Callable[..., Outcome]:
+    """Return a function that calls an entry point."""
+    return run_entry_point
 
 
 @pytest.fixture(scope="session")

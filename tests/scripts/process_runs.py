@@ -22,7 +22,7 @@ SMALL = (
 _PATIENCE = 90.0
 _CONTEXT = multiprocessing.get_context("forkserver")
 _CONTEXT.set_forkserver_preload(
-    ["mjlab.scripts.train_run", "mjlab.rl.runner", "mjlab.envs.manager_based_rl_env", "mjlab.sim"]
+    ["mjlab.scripts.train", "mjlab.rl.runner", "mjlab.envs.manager_based_rl_env", "mjlab.sim"]
 )
 
 
@@ -164,23 +164,23 @@ def fail_while_training(folder: Path, rank: int) -> None:
 
 def fail_while_building(folder: Path, rank: int) -> None:
     """Let process 1 fail when it makes its environment."""
-    from mjlab.scripts import train_run
+    from mjlab.scripts import train
 
-    build = train_run._build_env
+    build = train.training_env
 
     def failing(*args):
         if rank == 1:
             raise ValueError("no room in process 1")
         return build(*args)
 
-    train_run._build_env = failing
+    train.training_env = failing
 
 
 def count_lookups(folder: Path, rank: int) -> None:
     """Write down every look for the checkpoint to resume."""
-    from mjlab.scripts import train_run
+    from mjlab.scripts import train
 
-    look = train_run.checkpoint_to_resume
+    look = train.checkpoint_to_resume
 
     def counting(task, cfg):
         found = look(task, cfg)
@@ -189,4 +189,4 @@ def count_lookups(folder: Path, rank: int) -> None:
             file.write(f"{rank} {found} {len(list((folder / 'logs').glob('cartpole/*/')))}\n")
         return found
 
-    train_run.checkpoint_to_resume = counting
+    train.checkpoint_to_resume = counting

@@ -2,48 +2,24 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import os
 import subprocess
 import sys
-from dataclasses import dataclass, field
+from importlib.metadata import entry_points
 
 import pytest
 
 from mjlab.rl.checkpoint import CheckpointError
 from mjlab.scripts import cli
-from mjlab.scripts.cli import UserError, parse_flags, resolve_device, run_command, task_and_flags
+from mjlab.scripts.cli import run_command
 from mjlab.sim.engine import EngineUnavailableError
 from mjlab.tasks.registry import UnknownTaskError
+from mjlab.utils.errors import UserError
 from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
 
-USAGE = "usage: try TASK [flags]"
 TASK = "Mjlab-Cartpole-Swingup"
-
-
-@dataclass
-class Inner:
-    """Things."""
-
-    rate: float = 1.0
-    """A rate."""
-    switch: bool = False
-    """A switch below the top."""
-
-
-@dataclass
-class Flags:
-    """Flags of a command."""
-
-    fast_mode: bool = False
-    """A switch."""
-    count: int | None = None
-    """A number."""
-    inner: Inner = field(default_factory=Inner)
-    """More."""
-
-
-def parsed(*flags: str) -> Flags:
-    return parse_flags(Flags, Flags(), list(flags), "try")
 
 
 def ended(command, capsys) -> tuple[int, str, str]:
@@ -134,83 +110,77 @@ def test_a_reader_that_has_seen_enough_causes_no_message():
     assert done.stderr == ""
 
 
+@pytest.fixture
+def mjlab(run_main):
+    """Return a function that runs `mjlab` with arguments."""
+    return lambda *argv: run_main(cli.main, "mjlab", *argv)
+
+
 @pytest.mark.parametrize("argv", [[], ["-h"], ["--help"]])
-def test_without_a_task_the_usage_is_printed(argv, capsys):
-    with pytest.raises(SystemExit) as caught:
-        task_and_flags(argv, USAGE)
-    assert caught.value.code == 0
-    assert capsys.readouterr().out.strip() == USAGE
+def test_without_a_task_the_usage_is_printed(run, argv):
+    outcome = run("train", *argv)
+    assert outcome.status == 0
+    assert outcome.out.startswith("usage: train TASK")
 
 
-def test_the_task_comes_first():
-    assert task_and_flags([TASK, "--a", "1"], USAGE) == (TASK, ["--a", "1"])
-    with pytest.raises(UserError, match=r"comes first, before '--a'"):
-        task_and_flags(["--a", "1", TASK], USAGE)
+def test_the_task_comes_first(run):
+    outcome = run("train", "--a", "1", TASK)
+    assert outcome.status == 1
+    assert "'--a'" in outcome.message
+    assert "TASK" in outcome.message
 
 
-def test_an_unknown_task_is_answered_with_the_nearest_names():
-    with pytest.raises(UnknownTaskError) as caught:
-        task_and_flags(["Mjlab-Cartpole-Swing-Up"], USAGE)
-    assert "'Mjlab-Cartpole-Swing-Up'" in str(caught.value)
-    assert f"Did you mean {TASK}" in str(caught.value)
-    assert "list-envs" in str(caught.value)
+def test_an_unknown_task_is_answered_with_the_nearest_names(run):
+    message = run("play", "Mjlab-Cartpole-Swing-Up").message
+    assert "'Mjlab-Cartpole-Swing-Up'" in message
+    assert TASK in message
+    assert "list-envs" in message
 
 
-def test_flags_replace_fields_and_leave_the_others():
-    flags = parsed("--inner.rate", "3e-4", "--count", "5")
-    assert flags == Flags(count=5, inner=Inner(rate=3e-4))
-    assert parsed("--count", "None") == Flags()
+@pytest.mark.parametrize("command", cli.COMMANDS, ids=lambda command: command.name)
+def test_every_command_has_help_a_line_in_the_overview_and_a_function(mjlab, command):
+    assert f"  {command.name} " in cli.overview()
+    assert command.summary in cli.overview()
+    outcome = mjlab(command.name, "--help")
+    assert outcome.status == 0, outcome.err
+    assert outcome.out.startswith(f"usage: mjlab {command.name}")
+    module, _, function = command.function.partition(":")
+    assert list(inspect.signature(getattr(importlib.import_module(module), function)).parameters) == [
+        "argv", "prog",
+    ]  # fmt: skip
 
 
-@pytest.mark.parametrize("flag", ["--fast-mode", "--fast_mode"])
-def test_a_switch_needs_no_value_and_takes_one(flag):
-    assert parsed(flag) == Flags(fast_mode=True)
-    assert parsed(flag, "--count", "2") == Flags(fast_mode=True, count=2)
-    assert parsed(flag, "True") == Flags(fast_mode=True)
-    assert parsed(flag, "False") == Flags()
+def test_commands_are_installed_under_their_names():
+    scripts = {entry.name: entry.value for entry in entry_points(group="console_scripts")}
+    own = {name for name, value in scripts.items() if value.startswith("mjlab.scripts.")}
+    assert own == {"mjlab", *cli.ALIASES}
+    for name in cli.ALIASES:
+        module, _, function = scripts[name].partition(":")
+        assert callable(getattr(importlib.import_module(module), function))
 
 
-@pytest.mark.parametrize(
-    ("flags", "named"),
-    [(["--cuont", "3"], "--cuont"), (["--count", "many"], "many"), (["stray"], "stray")],
-)
-def test_a_flag_that_is_not_there_or_not_of_its_kind_ends_with_status_2(flags, named, capsys):
-    with pytest.raises(SystemExit) as caught:
-        parsed(*flags)
-    assert caught.value.code == 2
-    assert named in capsys.readouterr().err
+def test_underscores_and_unknown_commands(mjlab):
+    assert mjlab("list_envs", "--keyword", "Swingup").out.strip().startswith(f"1  {TASK}")
+    outcome = mjlab("trian", TASK)
+    assert outcome.status == 2
+    assert "'trian'" in outcome.message
+    assert "'train'" in outcome.message
 
 
-def test_a_mistyped_flag_is_answered_with_the_nearest(capsys):
-    with pytest.raises(SystemExit):
-        parsed("--inner.ratee", "3")
-    assert "--inner.rate" in capsys.readouterr().err
-
-
-def test_parsing_leaves_the_default_as_it_was():
-    default = Flags()
-    parse_flags(Flags, default, ["--inner.rate", "9", "--fast-mode"], "try")
-    assert default == Flags()
-
-
-@pytest.mark.parametrize(("asked", "device"), [("cpu", "cpu"), ("cuda", "cuda:0")])
-def test_the_device_is_the_one_asked_for(asked, device, monkeypatch):
-    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
-    assert resolve_device(asked) == device
-
-
-@pytest.mark.parametrize(("gpu", "device"), [(False, "cpu"), (True, "cuda:0")])
-def test_without_a_wish_the_device_is_a_gpu_where_there_is_one(gpu, device, monkeypatch):
-    monkeypatch.setattr("torch.cuda.is_available", lambda: gpu)
-    assert resolve_device(None) == device
-
-
-def test_a_device_that_cannot_be_used_is_refused_with_what_to_do(monkeypatch):
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    with pytest.raises(UserError, match=r"--device cuda:1 .* no CUDA GPU .* --device cpu"):
-        resolve_device("cuda:1")
-    with pytest.raises(UserError, match=r"'gpu' is not a device. Use cpu, cuda"):
-        resolve_device("gpu")
+def test_the_overview_and_the_version_load_nothing_heavy():
+    for flag in ("--help", "--version"):
+        code = (
+            f"import sys; sys.argv = ['mjlab', {flag!r}]\n"
+            "from mjlab.scripts.cli import main\n"
+            "try: main()\n"
+            "except SystemExit as end: assert end.code == 0\n"
+            "assert not {'torch', 'mujoco', 'tyro', 'numpy', 'rich'} & set(sys.modules)"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.strip()
 
 
 @pytest.mark.parametrize(
@@ -221,8 +191,8 @@ def test_what_only_answers_loads_nothing_heavy(arguments):
     code = (
         "import sys\n"
         f"sys.argv = {arguments!r}\n"
-        f"from mjlab.scripts.{arguments[0]} import main\n"
-        "try:\n    main()\nexcept SystemExit as ended:\n    assert ended.code == 0\n"
+        f"from mjlab.scripts.cli import {arguments[0]}\n"
+        f"try:\n    {arguments[0]}()\nexcept SystemExit as ended:\n    assert ended.code == 0\n"
         "heavy = {'torch', 'mujoco', 'numpy', 'tyro', 'rich', 'yaml', 'rsl_rl'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )

@@ -14,9 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mjlab.asset_zoo.robots import get_g1_robot_cfg
-from mjlab.scripts.cli import UserError
-from mjlab.scripts.csv_to_npz_run import CsvToNpzConfig, convert
-from mjlab.scripts.motion_page import MotionPage
+from mjlab.scripts.csv_to_npz import CsvToNpzConfig, MotionPage, convert
 from mjlab.tasks.tracking.motion_file import MotionFileError, read_motion
 from mjlab.tasks.tracking.motion_recording import (
     Recording,
@@ -27,6 +25,7 @@ from mjlab.tasks.tracking.motion_recording import (
     slerp,
     write_csv,
 )
+from mjlab.utils.errors import UserError
 
 JOINTS = get_g1_robot_cfg().build().joint_names
 
@@ -339,7 +338,7 @@ def test_the_page_plays_the_motion_and_follows_the_slider(csv, tmp_path):
     server = SimpleNamespace(gui=SimpleNamespace(add_checkbox=add, add_slider=add))
     model = get_g1_robot_cfg().build().compile()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mjlab.scripts.motion_page.ViserMujocoScene", lambda *a, **k: scene)
+        patch.setattr("mjlab.scripts.csv_to_npz.ViserMujocoScene", lambda *a, **k: scene)
         page.__init__(server, motion, model)
     page.advance(0.5)
     assert page.frame == widgets["Frame"].value == 25

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from mjlab.scripts import demo
-from mjlab.scripts.policy import load_policy, make_env, policy_env_cfg
+from mjlab.scripts.environments import make_env
+from mjlab.scripts.policy import load_policy, policy_env_cfg
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 
 GO1 = demo.DEMOS["go1"]
@@ -120,7 +121,7 @@ def test_a_policy_of_another_task_is_refused(run, go1_policy):
     [("linux", None, False), ("linux", ":1", True), ("darwin", None, True)],
 )
 def test_a_browser_is_opened_only_where_there_is_a_display(monkeypatch, platform, display, opened):
-    play_run = importlib.import_module("mjlab.scripts.play_run")
+    play_run = importlib.import_module("mjlab.scripts.play")
     monkeypatch.setattr(play_run.sys, "platform", platform)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     if display is None:

@@ -12,9 +12,9 @@ import mujoco
 import pytest
 
 from mjlab.envs import ManagerBasedRlEnv
-from mjlab.scripts.cli import UserError
 from mjlab.scripts.export_scene import ExportSceneConfig, run_export_scene
 from mjlab.tasks.registry import load_env_cfg
+from mjlab.utils.errors import UserError
 
 TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
 OPTIONS = ("timestep", "cone", "impratio", "solver", "iterations", "ls_iterations", "disableflags")

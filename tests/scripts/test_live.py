@@ -17,9 +17,8 @@ from commands import SMALL, TASK
 from mjlab.rl.checkpoint import load_checkpoint
 from mjlab.rl.run_logger import IterationStats
 from mjlab.scripts import live
-from mjlab.scripts.live import Exchange, LiveJob, LiveView
-from mjlab.scripts.live_view import NewestWeights
-from mjlab.scripts.train_run import TrainConfig
+from mjlab.scripts.live import Exchange, LiveJob, LiveView, NewestWeights
+from mjlab.scripts.train import TrainConfig
 
 STATS = IterationStats(
     iteration=3, total_iterations=9, total_steps=96, collection_time=1.0, learning_time=1.0,
@@ -180,7 +179,7 @@ def test_the_page_shows_the_policy_of_the_job(tmp_path, monkeypatch):
     import viser
 
     from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
-    from mjlab.scripts.live_view import _make_viewer
+    from mjlab.scripts.live import _make_viewer
 
     cfg = TrainConfig.from_task(TASK)
     cfg.env.scene.num_envs = 2

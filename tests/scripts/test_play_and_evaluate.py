@@ -11,8 +11,8 @@ import onnx
 import pytest
 from commands import SMALL
 
-from mjlab.scripts.cli import parse_flags
 from mjlab.scripts.evaluate import EvaluateConfig
+from mjlab.scripts.flags import parse_flags
 from mjlab.scripts.play import PlayConfig
 
 TASK = "Mjlab-Cartpole-Swingup"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import pytest
 import torch
@@ -91,18 +92,31 @@ def test_runs_of_tracking_are_evaluated_and_played_with_the_class_they_had(
     assert ("mlp.mlp.0.weight" in weights) == (name != "MLPModel")
 
 
+def test_settings_that_no_network_has_are_said_to_be_the_runs(run, trained, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(trained, folder)
+    params = folder / "params" / "agent.yaml"
+    saved = yaml.safe_load(params.read_text())
+    saved["actor"]["hidden_dims"] = [64, -1]
+    params.write_text(yaml.safe_dump(saved))
+    checkpoint = str(next(folder.glob("model_*.pt")))
+    outcome = run("evaluate", TASK, "--device", "cpu", "--checkpoint-file", checkpoint)
+    assert outcome.status == 1
+    assert "agent.yaml" in outcome.message
+    assert "-1" in outcome.message
+
+
 @pytest.mark.parametrize(
     "actor",
     [
         {"class_name": "pydoc:pipepager"},
-        {"class_name": "mjlab.rl.spatial_softmax:SpatialSoftmaxCNN"},
         {"class_name": ["MLPModel"]},
         {"distribution_cfg": {"class_name": "pydoc:pipepager", "cmd": "touch pwned"}},
         {"cnn_cfg": {"class_name": "os:system"}},
         {"cnn_cfg": {"activation": {"deep": ["os:system"]}}},
         {"cnn_cfg": "os:system"},
         {"hidden_dims": "nonsense"},
-        {"hidden_dims": [64, -1]},
+        {"hidden_dims": [64.5]},
         {"activation": "os:system"},
         {"obs_normalization": "yes"},
         {"rnn_type": "subprocess:run"},

@@ -15,7 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from mjlab.rl.checkpoint import load_checkpoint
 from mjlab.scripts.run_folder import checkpoints_in, read_run_info
-from mjlab.scripts.train_run import _build_env, parse_train_flags
+from mjlab.scripts.train import _build_env, parse_train_flags
 from mjlab.utils.processes import ProcessRank, available_cores
 from mjlab.utils.random import process_seed
 
@@ -204,9 +204,10 @@ def test_torchrun_trains_and_reports_a_failure(tmp_path):
 @pytest.mark.slow
 def test_the_launcher_trains_and_ctrl_c_saves_once(tmp_path):
     program = (
+        "import sys\nfrom mjlab.rl.distributed import launch_workers\n"
         "from mjlab.scripts.cli import run_command\n"
-        "from mjlab.scripts.launcher import launch_workers, train_command\n"
-        "run_command(lambda argv: launch_workers(train_command(argv[0], argv[1:]), 2))\n"
+        "command = [sys.executable, '-m', 'mjlab.scripts.train']\n"
+        "run_command(lambda argv: launch_workers(command + argv, 2))\n"
     )
     flags = [TASK, *SMALL, "--log-root", str(tmp_path), "--agent.max-iterations", "1000000"]
     interrupt_training([sys.executable, "-c", program, *flags], tmp_path, patience=120.0)
@@ -215,9 +216,9 @@ def test_the_launcher_trains_and_ctrl_c_saves_once(tmp_path):
 @pytest.mark.slow
 def test_workers_of_a_killed_launcher_save_and_end(tmp_path):
     program = (
-        "import sys\n"
-        "from mjlab.scripts.launcher import launch_workers, train_command\n"
-        "launch_workers(train_command(sys.argv[1], sys.argv[2:]), 2)\n"
+        "import sys\nfrom mjlab.rl.distributed import launch_workers\n"
+        "command = [sys.executable, '-m', 'mjlab.scripts.train']\n"
+        "launch_workers(command + sys.argv[1:], 2)\n"
     )
     flags = [TASK, *SMALL, "--log-root", str(tmp_path), "--agent.max-iterations", "1000000"]
     launcher = subprocess.Popen([sys.executable, "-c", program, *flags])

@@ -7,8 +7,7 @@ import json
 import pytest
 from commands import TASK
 
-from mjlab.envs.profiling import StepProfile
-from mjlab.scripts.profile_env_run import _text, profile_figures
+from mjlab.scripts.profile_env import StepProfile, _text, profile_rows
 from mjlab.tasks.registry import list_tasks
 
 SMALL = ("--num-envs", "4", "--steps", "3", "--warm-up", "1", "--device", "cpu")
@@ -48,7 +47,7 @@ def profile() -> StepProfile:
 
 
 def test_rows_are_sorted_by_time():
-    figures = profile_figures(profile())
+    figures = profile_rows(profile())
     assert [row["name"] for row in figures["phases"]] == [
         "physics", "observations", "rewards", "other",
     ]  # fmt: skip
@@ -65,7 +64,7 @@ def test_terms_that_take_much_are_named(much):
     if not much:
         one.step_time = 100.0
     head = {"task": "T", "num_envs": 8, "physics": "p", "steps": 10, "step_ms": 2.0}
-    last = _text({**head, **profile_figures(one)}).splitlines()[-1]
+    last = _text({**head, **profile_rows(one)}).splitlines()[-1]
     if much:
         assert last == (
             "More than 5 % of the step: observations/actor/x (25.0 %), rewards/b (6.2 %)."

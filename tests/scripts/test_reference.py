@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mjlab.rl.plot import read_scalars
-from mjlab.scripts.cli import UserError
 from mjlab.scripts.reference import (
     FALSE_ALARMS,
     Reference,
@@ -28,6 +27,7 @@ from mjlab.scripts.reference import (
     thinned,
 )
 from mjlab.scripts.run_folder import read_run_info, sessions_of
+from mjlab.utils.errors import UserError
 
 # An evaluation after every iteration, of short episodes.
 EVALUATED = (

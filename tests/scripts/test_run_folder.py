@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from mjlab.scripts.cli import UserError
 from mjlab.scripts.run_folder import (
     checkpoints_in,
-    named_checkpoint,
     newest_checkpoint,
     read_agent_params,
     read_run_info,
+    resolve_checkpoint,
     write_run_info,
 )
+from mjlab.utils.errors import UserError
 
 TASK = "My-Task"
 
@@ -79,7 +79,7 @@ def test_the_newest_run_is_the_one_with_the_newest_checkpoint(tmp_path):
     make_run(tmp_path, "2026-01-09", 9)
     older = make_run(tmp_path, "2026-01-01_long", 1, 2, changed=2e9)
     assert newest_checkpoint(tmp_path, TASK) == older / "model_2.pt"
-    assert named_checkpoint(tmp_path / "model_1.pt", TASK) == older / "model_1.pt"
+    assert resolve_checkpoint(tmp_path / "model_1.pt", TASK) == older / "model_1.pt"
 
 
 def test_a_run_that_does_not_name_its_task_may_be_of_this_one(tmp_path):
@@ -89,34 +89,34 @@ def test_a_run_that_does_not_name_its_task_may_be_of_this_one(tmp_path):
 
 def test_a_checkpoint_is_taken_where_it_is(tmp_path):
     run_dir = make_run(tmp_path, "run", 5)
-    assert named_checkpoint(run_dir / "model_5.pt", TASK) == run_dir / "model_5.pt"
+    assert resolve_checkpoint(run_dir / "model_5.pt", TASK) == run_dir / "model_5.pt"
     renamed = (run_dir / "model_5.pt").rename(tmp_path / "best.pt")
-    assert named_checkpoint(renamed, TASK) == renamed
+    assert resolve_checkpoint(renamed, TASK) == renamed
 
 
 def test_the_folder_of_the_run_may_be_left_out(tmp_path):
     make_run(tmp_path, "2026-01-01", 5, 500, task=TASK)
     newer = make_run(tmp_path, "2026-01-02", 5, 300, task=TASK)
-    assert named_checkpoint(tmp_path / "model_5.pt", TASK) == newer / "model_5.pt"
+    assert resolve_checkpoint(tmp_path / "model_5.pt", TASK) == newer / "model_5.pt"
 
 
 @pytest.mark.parametrize("ended", ["solved", "finished"])
 def test_a_run_that_ended_sooner_stands_in_with_its_last_checkpoint(tmp_path, ended, capsys):
     run_dir = make_run(tmp_path, "run", 5, 41, task=TASK, ended=ended)
-    assert named_checkpoint(tmp_path / "model_500.pt", TASK) == run_dir / "model_41.pt"
+    assert resolve_checkpoint(tmp_path / "model_500.pt", TASK) == run_dir / "model_41.pt"
     assert f"was {ended} before model_500.pt" in capsys.readouterr().err
     with pytest.raises(UserError):
-        named_checkpoint(tmp_path / "model_7.pt", TASK)
+        resolve_checkpoint(tmp_path / "model_7.pt", TASK)
 
 
 def test_a_run_that_was_interrupted_does_not_stand_in(tmp_path):
     run_dir = make_run(tmp_path, "run", 5, 41, task=TASK, ended="interrupted")
     with pytest.raises(UserError) as caught:
-        named_checkpoint(tmp_path / "model_500.pt", TASK)
+        resolve_checkpoint(tmp_path / "model_500.pt", TASK)
     assert f"no checkpoint {tmp_path / 'model_500.pt'}" in str(caught.value)
     assert str(run_dir / "model_41.pt") in str(caught.value)
 
 
 def test_where_there_are_no_checkpoints_the_message_says_how_to_make_some(tmp_path):
     with pytest.raises(UserError, match=f"`train {TASK}` makes some"):
-        named_checkpoint(tmp_path / "model_0.pt", TASK)
+        resolve_checkpoint(tmp_path / "model_0.pt", TASK)

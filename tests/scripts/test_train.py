@@ -12,7 +12,7 @@ from commands import SMALL
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from mjlab.rl.checkpoint import load_checkpoint
-from mjlab.scripts.cli import parse_flags
+from mjlab.scripts.flags import parse_flags
 from mjlab.scripts.run_folder import read_run_info
 from mjlab.scripts.train import TrainConfig, launch_training, run_train
 

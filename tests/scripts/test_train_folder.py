@@ -10,6 +10,7 @@ import pytest
 from commands import SMALL, TASK
 
 from mjlab.rl import MjlabOnPolicyRunner
+from mjlab.rl.divergence import RolloutWatch
 from mjlab.scripts.run_folder import NewRunFolder
 from mjlab.utils.os import create_locked, temporary_path
 
@@ -49,17 +50,17 @@ def test_a_run_that_fails_before_its_first_iteration_leaves_no_folder(attempt, m
         assert list(Path(self.logger.log_dir).iterdir())
         raise ValueError("not today")
 
-    monkeypatch.setattr(MjlabOnPolicyRunner, "_start", fail)
+    monkeypatch.setattr(MjlabOnPolicyRunner, "_initial_observations", fail)
     outcome, left = attempt()
     assert "not today" in outcome.message
     assert left == []
 
 
 def test_a_run_that_fails_later_keeps_its_folder(attempt, monkeypatch):
-    def fail(self, observations):
+    def fail(self):
         raise ValueError("not today")
 
-    monkeypatch.setattr(MjlabOnPolicyRunner, "_collect", fail)
+    monkeypatch.setattr(RolloutWatch, "start", fail)
     outcome, (run_dir,) = attempt()
     assert "not today" in outcome.message
     assert (run_dir / "run.json").is_file()
@@ -117,7 +118,7 @@ def test_a_folder_that_takes_no_more_is_told_without_tracebacks(tmp_path):
     program = (
         "import resource, signal, time\n"
         "now = time.time\n"
-        "from mjlab.scripts import train_run\n"
+        "from mjlab.scripts import display\n"
         "def limit(self, stats):\n"
         "    if stats.iteration < 3:\n        return\n"
         "    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
@@ -125,7 +126,7 @@ def test_a_folder_that_takes_no_more_is_told_without_tracebacks(tmp_path):
         # Event files are written every ten seconds.
         "    time.time = lambda: now() + 1000.0 * stats.iteration\n"
         "    time.sleep(0.02)\n"
-        "train_run._Beginning.on_iteration = limit\n"
+        "display.KeepRunFolder.on_iteration = limit\n"
         "from mjlab.scripts.train import main\n"
         "main()\n"
     )
@@ -144,8 +145,8 @@ def test_a_folder_that_takes_no_more_is_told_without_tracebacks(tmp_path):
 def test_a_killed_writer_leaves_what_is_removed(tmp_path):
     (tmp_path / "old").mkdir()
     program = (
-        "import os, sys\nfrom mjlab.rl import checkpoint\n"
-        "checkpoint._write = lambda *_: os.kill(os.getpid(), 9)\n"
+        "import os, sys, torch\nfrom mjlab.rl import checkpoint\n"
+        "torch.save = lambda *_: os.kill(os.getpid(), 9)\n"
         "checkpoint.save_checkpoint({}, sys.argv[1])\n"
     )
     path = tmp_path / "old" / "model_1.pt"

@@ -8,27 +8,31 @@ import sys
 import numpy as np
 import pytest
 
-from mjlab.scripts.cli import UserError
-from mjlab.scripts.terrain_knobs import knobs_of, with_values
-from mjlab.scripts.terrain_page import TerrainPage
-from mjlab.scripts.terrain_scene import build_terrain_scene
-from mjlab.scripts.visualize_terrain import VisualizeTerrainConfig, run_visualize_terrain
+from mjlab.scripts.visualize_terrain import (
+    TerrainPage,
+    VisualizeTerrainConfig,
+    build_terrain_scene,
+    controls_of,
+    run_visualize_terrain,
+    with_values,
+)
 from mjlab.terrains.config import ALL_TERRAIN_PRESETS, flat, hf_pyramid_slope, wave_terrain
+from mjlab.utils.errors import UserError
 
 
 @pytest.mark.parametrize("name", ALL_TERRAIN_PRESETS)
 def test_every_preset_has_knobs_for_all_but_its_place_in_the_grid(name):
     cfg = ALL_TERRAIN_PRESETS[name]()
-    knobs = {knob.field: knob for knob in knobs_of(cfg)}
-    assert set(knobs) == set(vars(cfg)) - {
+    controls = {control.field: control for control in controls_of(cfg)}
+    assert set(controls) == set(vars(cfg)) - {
         "proportion", "size", "flat_patch_sampling", "downsampled_scale",
     }  # fmt: skip
-    for knob in knobs.values():
-        if knob.kind in ("number", "count"):
-            assert knob.low <= knob.value <= knob.high
-        if knob.kind == "range":
-            assert knob.low <= knob.value[0] <= knob.value[1] <= knob.high
-    assert with_values(cfg, {knob.field: knob.value for knob in knobs.values()}) == cfg
+    for control in controls.values():
+        if control.kind in ("number", "count"):
+            assert control.low <= control.value <= control.high
+        if control.kind == "range":
+            assert control.low <= control.value[0] <= control.value[1] <= control.high
+    assert with_values(cfg, {control.field: control.value for control in controls.values()}) == cfg
 
 
 def test_values_of_sliders_become_fields_of_a_copy():

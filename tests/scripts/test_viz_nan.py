@@ -14,10 +14,8 @@ import numpy as np
 import pytest
 import torch
 
-from mjlab.scripts.cli import UserError
-from mjlab.scripts.nan_page import NanPage
-from mjlab.scripts.viz_nan import VizNanConfig, run_viz_nan
-from mjlab.scripts.viz_nan_run import load_dump
+from mjlab.scripts.viz_nan import NanPage, VizNanConfig, load_dump, run_viz_nan
+from mjlab.utils.errors import UserError
 from mjlab.utils.nan_guard import CHECKED_FIELDS, NanDump, NanGuard, NanGuardCfg
 
 XML = """

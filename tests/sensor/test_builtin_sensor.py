@@ -98,7 +98,7 @@ def test_wrong_objects_are_refused(sensor):
 
 
 def test_unknown_kinds_and_reference_objects_are_refused():
-    with pytest.raises(ValueError, match="'gyroo' is unknown. Choose from: accelerometer"):
+    with pytest.raises(ValueError, match="sensor_type.*'accelerometer'.*'gyroo'"):
         BuiltinSensorCfg(name="x", sensor_type="gyroo", obj=ref("site"))
     with pytest.raises(ValueError, match="ref of a framepos must be an ObjRef of type body or"):
         BuiltinSensorCfg(name="x", sensor_type="framepos", obj=ref("site"), ref=ref("joint"))
@@ -147,7 +147,7 @@ def test_elements_of_the_terrain_are_found_though_it_has_no_prefix():
     wrong = BuiltinSensorCfg(
         name="x", sensor_type="framepos", obj=ObjRef("xbody", "base", entity="terrain")
     )
-    with pytest.raises(ValueError, match=r"entity 'terrain' .* \['world', 'terrain'\]"):
+    with pytest.raises(ValueError, match=r"'base' .*entity 'terrain'.*\['world', 'terrain'\]"):
         scene_with(wrong, terrain=TerrainEntityCfg())
 
 
@@ -163,10 +163,10 @@ def test_an_entity_called_terrain_has_its_prefix_where_there_is_no_terrain():
 
 def test_unknown_elements_and_entities_list_the_candidates():
     site = BuiltinSensorCfg(name="x", sensor_type="gyro", obj=ObjRef("site", "imuu", entity="r"))
-    with pytest.raises(ValueError, match=r"the site 'imuu', which entity 'r' .* \['imu'\]"):
+    with pytest.raises(ValueError, match=r"site 'imuu' .*entity 'r'.*\['imu'\]"):
         scene_with(site)
     entity = BuiltinSensorCfg(name="x", sensor_type="gyro", obj=ObjRef("site", "imu", entity="q"))
-    with pytest.raises(ValueError, match=r"entity 'q'. The scene has: \['r'\]"):
+    with pytest.raises(ValueError, match=r"entity 'q'.*\['r'\]"):
         scene_with(entity)
 
 

@@ -327,23 +327,23 @@ def test_the_render_context_is_that_of_warp():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"width": 0}, r"width is 0; an image has a whole number of pixels, at least 1"),
-        ({"height": -3}, r"height is -3"),
-        ({"width": 3.5}, r"width is 3.5"),
-        ({"data_types": ()}, r"data_types is empty.*rgb, depth, segmentation"),
-        ({"data_types": ("rgb", "normals")}, r"'normals', which is unknown. Choose from: rgb"),
-        ({"data_types": "rgb"}, r"the string 'rgb'; give a tuple"),
+        ({"width": 0}, r"width: expected an integer >= 1, got 0"),
+        ({"height": -3}, r"height.* -3"),
+        ({"width": 3.5}, r"width.* 3.5"),
+        ({"data_types": ()}, r"data_types.*rgb, depth, segmentation.*\(\)"),
+        ({"data_types": ("rgb", "normals")}, r"data_types.*'rgb'.*'normals'"),
+        ({"data_types": "rgb"}, r"data_types.*tuple.*'rgb'"),
         ({"data_types": ("rgb", "rgb")}, r"twice"),
-        ({"enabled_geom_groups": ()}, r"would see nothing. Geom groups are 0 to 5"),
-        ({"enabled_geom_groups": (0, 6)}, r"enabled_geom_groups has 6, which is unknown"),
-        ({"fovy": -1.0}, r"fovy is -1.0; it has to be positive"),
-        ({"camera_name": None, "fovy": 180.0}, r"less than 180 degrees"),
+        ({"enabled_geom_groups": ()}, r"enabled_geom_groups is empty.*\[0, 1, 2, 3, 4, 5\]"),
+        ({"enabled_geom_groups": (0, 6)}, r"enabled_geom_groups.*\[0, 1, 2, 3, 4, 5\].* 6"),
+        ({"fovy": -1.0}, r"fovy.* -1.0"),
+        ({"camera_name": None, "fovy": 180.0}, r"fovy.*\(0, 180\).* 180.0"),
     ],
 )
 def test_a_config_that_makes_no_sense_is_refused(changes, message):
     with pytest.raises(ValueError, match=message) as error:
         camera(**changes).build()
-    assert str(error.value).startswith("Camera sensor 'cam': ")
+    assert str(error.value).startswith("Camera sensor 'cam'")
 
 
 def test_a_camera_that_does_not_exist_is_refused_with_those_that_do():
@@ -351,13 +351,13 @@ def test_a_camera_that_does_not_exist_is_refused_with_those_that_do():
         with pytest.raises(ValueError) as error:
             scene_with(camera(camera_name="room/dawn", **changes))
         text = str(error.value)
-        assert "there is no camera 'room/dawn'" in text
-        assert "room/down, room/inside, room/lens" in text
-        assert "Did you mean 'room/down'?" in text
+        assert "camera 'room/dawn'" in text
+        assert all(repr(name) in text for name in ("room/down", "room/inside", "room/lens"))
+        assert "did you mean 'room/down'" in text
 
 
 def test_a_body_that_does_not_exist_and_a_name_that_is_taken_are_refused():
-    with pytest.raises(ValueError, match=r"no body 'ball' .* The scene has: .*ball/ball"):
+    with pytest.raises(ValueError, match="body 'ball' .*Available: .*ball/ball"):
         scene_with(camera(camera_name=None, parent_body="ball"), ball=BALL)
     with pytest.raises(
         ValueError, match="has a camera 'room/down' already.*camera_name='room/down'"

@@ -130,19 +130,19 @@ def test_an_intrinsic_matrix_gives_the_vertical_field_of_view():
 @pytest.mark.parametrize(
     ("pattern", "message"),
     [
-        (GridPatternCfg(resolution=0.0), "resolution is 0.0; it has to be positive"),
-        (GridPatternCfg(resolution=-0.1), "resolution is -0.1"),
-        (GridPatternCfg(resolution=math.nan), "resolution is nan"),
-        (GridPatternCfg(size=(1.0, -1.0)), "0 or more"),
+        (GridPatternCfg(resolution=0.0), "resolution.* 0.0"),
+        (GridPatternCfg(resolution=-0.1), "resolution.* -0.1"),
+        (GridPatternCfg(resolution=math.nan), "resolution.* nan"),
+        (GridPatternCfg(size=(1.0, -1.0)), r"size.*\(1.0, -1.0\)"),
         (GridPatternCfg(direction=(0.0, 0.0, 0.0)), "not all 0"),
         (RingPatternCfg((), include_center=False), "no rays"),
         (RingPatternCfg.single_ring(num_samples=0), "at least 1 ray"),
         (RingPatternCfg.single_ring(radius=-0.1), "radius of 0 or more"),
-        (PinholeCameraPatternCfg(width=0), "0 x 12 pixels"),
+        (PinholeCameraPatternCfg(width=0), "pixels.* 0 x 12"),
         (PinholeCameraPatternCfg(fovy=180.0), "between 0 and 180"),
         (
             PinholeCameraPatternCfg.from_mujoco_camera("eyes"),
-            "no camera 'eyes'. The scene has: eye",
+            "camera 'eyes'.*'eye'",
         ),
     ],
 )

@@ -412,15 +412,15 @@ def test_whole_numbers_that_nothing_was_compiled_from_may_differ(field):
 
 def test_bad_requests_are_refused_when_the_simulation_is_built():
     spec = mujoco.MjSpec.from_string(SLIDER_AND_BALL)
-    with pytest.raises(ValueError, match="number of environments is 0"):
+    with pytest.raises(ValueError, match="num_envs.*got 0"):
         Simulation(0, SimulationCfg(), spec=spec, device="cpu")
     with pytest.raises(ValueError, match="exactly one"):
         Simulation(1, SimulationCfg(), device="cpu")
-    with pytest.raises(ValueError, match=r"Unknown engine 'bullet'.*native, warp"):
+    with pytest.raises(ValueError, match=r"engine.*native.*warp.*'bullet'"):
         Simulation(1, SimulationCfg(engine="bullet"), spec=spec, device="cpu")  # ty: ignore
     with pytest.raises(EngineUnavailableError, match="--engine warp"):
         Simulation(1, SimulationCfg(engine="native"), spec=spec, device="cuda:0")
-    with pytest.raises(ValueError, match="num_threads is -1"):
+    with pytest.raises(ValueError, match="num_threads.*got -1"):
         Simulation(1, SimulationCfg(num_threads=-1), spec=spec, device="cpu")
 
 
@@ -439,12 +439,12 @@ def test_options_are_written_and_unknown_ones_listed():
     assert model.opt.gravity[2] == -1
     assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
-    with pytest.raises(ValueError, match=r"disableflags: 'contacts'.*contact"):
+    with pytest.raises(ValueError, match=r"disableflags.*'contact'.*'contacts'"):
         MujocoCfg(disableflags=("contacts",)).apply(model)
-    with pytest.raises(ValueError, match=r"solver: 'magic'.*newton"):
+    with pytest.raises(ValueError, match=r"solver.*'newton'.*'magic'"):
         MujocoCfg(solver="magic").apply(model)  # ty: ignore
     for wrong in (mujoco.mjtCone.mjCONE_ELLIPTIC, 1, None, ("pyramidal", "elliptic")):
-        with pytest.raises(ValueError, match=r"MujocoCfg.cone: .*pyramidal, elliptic"):
+        with pytest.raises(ValueError, match=r"MujocoCfg.cone.*'pyramidal', 'elliptic'"):
             MujocoCfg(cone=wrong).apply(model)  # ty: ignore
 
 

@@ -275,8 +275,8 @@ def test_the_annotations_of_all_its_configs_resolve_at_run_time(task):
 
 
 def test_its_help_lists_the_flags_of_its_terms(task):
-    from mjlab.scripts.cli import parse_flags
-    from mjlab.scripts.train_run import TrainConfig
+    from mjlab.scripts.flags import parse_flags
+    from mjlab.scripts.train import TrainConfig
 
     out = io.StringIO()
     with contextlib.redirect_stdout(out), pytest.raises(SystemExit) as ended:

@@ -381,7 +381,7 @@ def test_a_package_written_for_release_1_1_builds_and_steps(old_style):
 
 
 def test_a_package_written_for_release_1_1_trains(old_style, tmp_path):
-    from mjlab.scripts.train_run import TrainConfig, launch_training
+    from mjlab.scripts.train import TrainConfig, launch_training
 
     cfg = TrainConfig.from_task("Old-Style-Cartpole")
     cfg.device, cfg.log_root = "cpu", str(tmp_path / "logs")

@@ -23,7 +23,7 @@ DEVIATIONS: dict[str, set[str]] = {
 # What evaluations measure is ours, too. Sensors of collisions report the strongest contact, where
 # the tables have them report any.
 _TRACKING_ERRORS = {
-    name: f"tasks.velocity.tracking_errors:{name}" for name in ("lin_vel_error", "ang_vel_error")
+    name: f"tasks.velocity.rl.ppo:{name}" for name in ("lin_vel_error", "ang_vel_error")
 }
 for task, positions in {
     "Mjlab-Velocity-Flat-Unitree-Go1": [],
@@ -40,8 +40,10 @@ for task, positions in {
     }
 
 _PLACEMENT = {
-    "metrics": {n: f"tasks.manipulation.success:{n}" for n in ("position_error", "at_goal")},
-    "success_func": "tasks.manipulation.success:placed_at_goal",
+    "metrics": {
+        n: f"tasks.manipulation.config.yam.rl_cfg:{n}" for n in ("position_error", "at_goal")
+    },
+    "success_func": "tasks.manipulation.config.yam.rl_cfg:placed_at_goal",
 }
 for task in (
     "Mjlab-Lift-Cube-Yam",
@@ -68,7 +70,7 @@ DEVIATIONS["Mjlab-Multi-Cube-Seg-Yam"] |= {
 # Motion tracking works without naming a motion, ends episodes where the motion does, and plays without
 # noise in the joints. What evaluations measure, and how, is ours.
 _MOTION_ERRORS = {
-    name: f"tasks.tracking.evaluation:{name}"
+    name: f"tasks.tracking.mdp.metrics:{name}"
     for name in ("mpkpe", "r_mpkpe", "joint_vel_error", "ee_pos_error", "ee_ori_error")
 }
 _MOTION_ENDED = {
@@ -81,7 +83,7 @@ _MOTION_EVALUATION = {
     "_": "EvaluationCfg",
     "metrics": _MOTION_ERRORS,
     "success_is_survival": True,
-    "prepare_env": "tasks.tracking.evaluation:play_motions_once",
+    "prepare_env": "tasks.tracking.mdp.metrics:play_motions_once",
 }
 for variant in ("", "-No-State-Estimation"):
     DEVIATIONS[f"Mjlab-Tracking-Flat-Unitree-G1{variant}"] = {

@@ -51,7 +51,7 @@ def test_a_rack_keeps_power_and_energy(inertia, speed, torque, radius):
 
 
 def test_a_rack_needs_a_positive_ratio():
-    with pytest.raises(ValueError, match="must be positive"):
+    with pytest.raises(ValueError, match="transmission_ratio"):
         reflect_rotary_to_linear(1.0, 1.0, 1.0, 0.0)
 
 

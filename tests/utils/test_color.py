@@ -63,7 +63,7 @@ def test_a_ramp_keeps_the_hue(t, alpha):
 
 @pytest.mark.parametrize("t", [-0.1, 1.1])
 def test_a_ramp_ends(t):
-    with pytest.raises(ValueError, match="from 0 to 1"):
+    with pytest.raises(ValueError, match="t: "):
         brand_ramp((1, 0, 0), t)
 
 

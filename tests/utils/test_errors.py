@@ -1,5 +1,6 @@
 import pickle
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -51,6 +52,7 @@ def test_counts_are_integers_from_the_minimum_up(value):
     with pytest.raises(ValueError, match="num_envs"):
         check_count("num_envs", value)
     check_count("num_envs", 1)
+    check_count("num_envs", np.int64(1))
 
 
 def test_choices_and_names():

@@ -243,5 +243,5 @@ def test_a_file_that_is_no_dump_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("field", ["buffer_size", "max_envs_to_dump"])
 def test_sizes_below_one_are_refused(model: mujoco.MjModel, tmp_path: Path, field: str) -> None:
-    with pytest.raises(ValueError, match=f"{field} is 0; it has to be at least 1"):
+    with pytest.raises(ValueError, match=f"{field}.*0"):
         make_guard(model, tmp_path, **{field: 0})

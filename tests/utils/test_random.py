@@ -43,7 +43,7 @@ def test_deterministic_algorithms_are_switched_on_when_asked():
 
 @pytest.mark.parametrize("seed", [-1, 2**32])
 def test_a_seed_out_of_range_is_refused(seed):
-    with pytest.raises(ValueError, match=f"seed is {seed}"):
+    with pytest.raises(ValueError, match=f"seed.*{seed}"):
         seed_rng(seed)
 
 

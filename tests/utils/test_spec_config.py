@@ -214,7 +214,7 @@ def test_a_skybox_from_a_gradient_and_a_cube_from_files():
         ({"builtin": "flat", "width": 0, "height": 4}, "width is 0; it must be positive"),
         ({"builtin": "flat", "width": 4}, "height None"),
         ({}, "has no source"),
-        ({"builtin": "stripes"}, r"'stripes'; it must be one of \['checker'"),
+        ({"builtin": "stripes"}, r"builtin.*\['none'.*'stripes'"),
         ({"type": "skybox", "file": "sky.png"}, "six faces"),
         ({"type": "skybox", "file": "sky.png", "gridsize": (1, 1)}, "six faces"),
         ({"cubefiles": ("a.png",)}, "1 cubefiles; it needs 6"),
@@ -262,13 +262,11 @@ def test_lights_and_cameras_are_added_to_bodies(spec):
 
 @pytest.mark.parametrize("cls", [LightCfg, CameraCfg])
 def test_an_unknown_body_or_mode_is_refused_with_the_choices(spec, cls):
-    with pytest.raises(
-        ValueError, match=r"'leg', which does not exist. Bodies: \['world', 'base'\]"
-    ):
+    with pytest.raises(ValueError, match=rf"{cls.__name__} body 'leg'.*\['world', 'base'\]"):
         cls(name="x", body="leg").edit_spec(spec)
-    with pytest.raises(ValueError, match="the body 'leg'"):
+    with pytest.raises(ValueError, match="body 'leg'"):
         cls(name="x", mode="targetbody", target="leg").edit_spec(spec)
-    with pytest.raises(ValueError, match=r"mode is 'orbit'; it must be one of \['fixed'"):
+    with pytest.raises(ValueError, match=r"mode.*\['fixed'.*'orbit'"):
         cls(name="x", mode="orbit").edit_spec(spec)
     with pytest.raises(ValueError, match="needs `target`"):
         cls(name="x", mode="targetbody").edit_spec(spec)

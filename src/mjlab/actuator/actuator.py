@@ -10,7 +10,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import Enum
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import mujoco
@@ -20,6 +19,7 @@ from mjlab.utils.buffers import DelayBuffer
 from mjlab.utils.indexing import Columns, EnvIds, read_columns, write_columns
 from mjlab.utils.mujoco import CommandField as CommandField
 from mjlab.utils.mujoco import control_columns
+from mjlab.utils.spec import TransmissionType as TransmissionType
 from mjlab.utils.spec import apply_target_overrides
 from mjlab.utils.state import stateful
 
@@ -53,14 +53,6 @@ def is_constant_within_step(function: Callable[..., Any]) -> bool:
 
 
 # MERGED mjlab.actuator.actuator: What an actuator is told, and where in an entity's data that stands.
-
-
-class TransmissionType(str, Enum):  # noqa: UP042 (part of the interface)
-    """What an actuator acts on."""
-
-    JOINT = "joint"
-    TENDON = "tendon"
-    SITE = "site"
 
 
 @dataclass

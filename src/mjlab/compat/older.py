@@ -20,8 +20,8 @@ import numpy as np
 import torch
 
 from mjlab.actuator.actuator import Actuator, ActuatorCfg
+from mjlab.envs.mdp import dr
 from mjlab.envs.mdp.dr._core import BODY, GEOM, ROBOT, SITE, FieldRow, randomize
-from mjlab.envs.mdp.dr._table import TABLE
 from mjlab.envs.mdp.dr.actuator import selected_actuators
 from mjlab.managers.event_manager import derived_fields
 from mjlab.sim.randomization import RecomputeLevel
@@ -88,9 +88,9 @@ class FieldSpec:
 _QUATERNIONS = {
     row.name: row
     for row in (
-        FieldRow("body_iquat", "body_iquat", BODY, "", recompute=RecomputeLevel.set_const),
-        FieldRow("geom_quat", "geom_quat", GEOM, ""),
-        FieldRow("site_quat", "site_quat", SITE, ""),
+        FieldRow("body_iquat", "body_iquat", BODY, recompute=RecomputeLevel.set_const),
+        FieldRow("geom_quat", "geom_quat", GEOM),
+        FieldRow("site_quat", "site_quat", SITE),
     )
 }
 _FIELDS = (
@@ -108,7 +108,7 @@ _FIELDS = (
     "qpos0",
 )
 _ROWS = {
-    **{row.field: row for row in TABLE.values() if row.field in _FIELDS},
+    **{field: getattr(dr, field).row for field in _FIELDS},
     **_QUATERNIONS,
 }
 
@@ -314,10 +314,10 @@ class ContactSlot:
     @property
     def data_view(self) -> torch.Tensor:
         """Present values, (N, number of slots times size of the field)."""
-        layout = self.sensor._layout
-        values = layout.split(self.sensor._block())[self.field_name]
-        first = self.index * layout.num_slots
-        return values[:, first : first + layout.num_slots].flatten(1)
+        values = self.sensor._split(self.sensor._block())[self.field_name]
+        num_slots = self.sensor.cfg.num_slots
+        first = self.index * num_slots
+        return values[:, first : first + num_slots].flatten(1)
 
 
 def contact_slots(sensor: ContactSensor) -> list[ContactSlot]:
@@ -455,7 +455,7 @@ def run_sim(
         line_range: First and last line to read, counted from 1. None reads all.
         renderer: Without effect.
     """
-    from mjlab.scripts.csv_to_npz_run import record_motion
+    from mjlab.scripts.csv_to_npz import record_motion
     from mjlab.tasks.tracking.motion_file import npz_path, write_motion
     from mjlab.tasks.tracking.motion_recording import make_motion, read_csv, resampled
 

@@ -1,10 +1,18 @@
-"""Checkpoint files: written whole or not at all, and loaded without running what is in them."""
+"""Checkpoint files: written whole or not at all, and loaded without running what is in them.
+
+A checkpoint holds plain data only, which `torch.load(weights_only=True)` reads: tensors, numbers,
+strings, None, and dicts, lists, tuples and sets of those. Beside what the algorithm saves it has
+the number of iterations and `training_state`: what exact resume needs beyond the networks, which
+are environments, generators and clocks.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import errno
 import io
+import logging
 import math
 import os
 import pickle
@@ -13,28 +21,53 @@ import tempfile
 import warnings
 import zipfile
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from mjlab.rl.learners import Learner
 from mjlab.rl.rsl import TensorDict
+from mjlab.utils.errors import MjlabError
 from mjlab.utils.os import replacing
 from mjlab.utils.random import rng_state, set_rng_state
 
 if TYPE_CHECKING:
     from mjlab.rl.rsl import VecEnv
-    from mjlab.rl.run_logger import RunLogger
 
+logger = logging.getLogger(__name__)
 
-# MERGED mjlab.rl.checkpoint: Plain data: what a checkpoint may hold, because loading it runs no code.
+VERSION = 1
+"""Format of `training_state`."""
 
+# Only in checkpoints of SAC.
+_SAC_KEY = "sac_state_dict"
+# The entries whose type is known, whoever wrote the file: a dict, or a number of iterations.
+_DICT_ENTRIES = (
+    "model_state_dict", "actor_state_dict", "critic_state_dict", "student_state_dict",
+    "teacher_state_dict", "optimizer_state_dict", "rnd_state_dict", "rnd_optimizer_state_dict",
+    "infos", "training_state",
+)  # fmt: skip
+_COUNT_ENTRIES = {"iter": -1, "iterations_finished": 0, "last_evaluated": 0}
+# Entries of learning, beside the networks.
+_LEARNING_ENTRIES = ("optimizer_state_dict", "rnd_optimizer_state_dict", _SAC_KEY)
 
-# Exactly these: subclasses (enums, named tuples, numpy's float64) are pickled as calls of their
-# class, which loading with `weights_only=True` refuses.
+# Of older layouts: names of the standard deviation, and prefixes of actor and critic in one state dict.
+_STD_NAMES = {
+    "std": "distribution.std_param",
+    "log_std": "distribution.log_std_param",
+}
+_SINGLE_MODEL_PREFIXES = {
+    "actor.": ("actor_state_dict", "mlp."),
+    "actor_obs_normalizer.": ("actor_state_dict", "obs_normalizer."),
+    "critic.": ("critic_state_dict", "mlp."),
+    "critic_obs_normalizer.": ("critic_state_dict", "obs_normalizer."),
+}
+
+# Plain data are exactly these: subclasses (enums, named tuples, numpy's float64) are pickled as calls
+# of their class, which loading with `weights_only=True` refuses.
 _ATOMS = (
     type(None), bool, int, float, complex, str, bytes,
     torch.Tensor, torch.nn.Parameter, torch.Size, torch.dtype, torch.device,
@@ -43,76 +76,15 @@ _DICTS = (dict, OrderedDict)
 _SEQUENCES = (list, tuple, set)
 
 
-def as_plain_data(value: Any, path: str = "") -> Any:
-    """Return `value` with numpy's scalars as Python's; containers without any are returned as is.
-
-    Args:
-        value: Tensors, numbers, strings, None, and dicts, lists, tuples and sets of those.
-        path: Where in a file `value` is to be, for the message.
-
-    Raises:
-        TypeError: something else is in there; the message says where and of which type.
-    """
-    if isinstance(value, np.generic):
-        value = value.item()
-    kind = type(value)
-    if kind in _ATOMS:
-        return value
-    if kind in _DICTS:
-        return _plain_dict(value, path)
-    if kind in _SEQUENCES:
-        items = [as_plain_data(item, f"{path}[{index}]") for index, item in enumerate(value)]
-        same = all(one is other for one, other in zip(items, value, strict=True))
-        return value if same else kind(items)
-    raise TypeError(f"{path or 'it'} is a {kind.__module__}.{kind.__qualname__}")
-
-
-def _plain_dict(value: dict[Any, Any], path: str) -> dict[Any, Any]:
-    items = {}
-    same = True
-    for key, item in value.items():
-        plain_key = as_plain_data(key, f"a key of {path or 'it'}")
-        items[plain_key] = as_plain_data(item, f"{path}.{key}" if path else str(key))
-        same = same and plain_key is key and items[plain_key] is item
-    if same:
-        return value
-    # A copy and not a new dict, because state dicts of modules carry versions as an attribute.
-    plain = copy.copy(value)
-    plain.clear()
-    plain.update(items)
-    return plain
-
-
-# Only in checkpoints of SAC.
-_SAC_KEY = "sac_state_dict"
-
-
-class CheckpointError(RuntimeError):
+class CheckpointError(MjlabError, RuntimeError):
     """A checkpoint could not be written, read or used; the message says what to do."""
 
 
-class RunFolderError(OSError):
+class RunFolderError(MjlabError, OSError):
     """A run folder cannot be written to."""
 
 
-def ensure_writable_folder(folder: str | os.PathLike[str]) -> Path:
-    """Make `folder` if it is missing, and write a file into it to see that this works.
-
-    Raises:
-        RunFolderError: the folder cannot be made or written to.
-    """
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=folder, prefix=".write-test-") as file:
-            file.write(b"x")
-            file.flush()
-    except OSError as error:
-        raise RunFolderError(
-            f"The run folder {str(folder)!r} cannot be written to ({error.strerror or error}). "
-            "Choose another place with --log-root, or change its permissions."
-        ) from error
-    return folder
+# Files.
 
 
 def save_checkpoint(data: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
@@ -138,55 +110,28 @@ def save_checkpoint(data: Mapping[str, Any], path: str | os.PathLike[str]) -> No
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path, flush=True) as file:
-            _write(data, file)
-        _flush_folder(path.parent)
+            # Serialized in memory first, because torch's zip writer turns a failing `write` of the
+            # file below it into a RuntimeError that hides the reason.
+            buffer = io.BytesIO()
+            torch.save(data, buffer)
+            file.write(buffer.getbuffer())
+        # The rename itself is on the disk only once the folder is. Not every system can open one.
+        with contextlib.suppress(OSError):
+            folder = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
     except OSError as error:
-        raise CheckpointError(_save_message(path, error)) from error
-
-
-def _write(data: Mapping[str, Any], file: IO[bytes]) -> None:
-    # Serialized in memory first, because torch's zip writer turns a failing `write` of the file
-    # below it into a RuntimeError that hides the reason.
-    buffer = io.BytesIO()
-    torch.save(dict(data), buffer)
-    file.write(buffer.getbuffer())
-
-
-def _flush_folder(folder: Path) -> None:
-    # The rename itself is on the disk only once the folder is. Not every system can open one.
-    try:
-        descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
-        os.fsync(descriptor)
-    except OSError:
-        pass
-    finally:
-        os.close(descriptor)
-
-
-def _save_message(path: Path, error: OSError) -> str:
-    kept = latest_checkpoint(path.parent)
-    rescue = f" The last checkpoint, {str(kept)!r}, is intact." if kept is not None else ""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return (
-            f"The disk is full: the checkpoint {str(path)!r} could not be written.{rescue} "
-            "Make room and resume with --agent.resume True."
-        )
-    return f"The checkpoint {str(path)!r} could not be written ({error.strerror or error}).{rescue}"
-
-
-def latest_checkpoint(folder: Path) -> Path | None:
-    """Return the `model_<number>.pt` with the highest number in `folder`, or None."""
-    if not folder.is_dir():
-        return None
-    numbered = {
-        int(match.group(1)): path
-        for path in folder.iterdir()
-        if (match := re.fullmatch(r"model_(\d+)\.pt", path.name))
-    }
-    return numbered[max(numbered)] if numbered else None
+        is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        reason = "" if is_full else f" ({error.strerror or error})"
+        kept = latest_checkpoint(path.parent)
+        raise CheckpointError(
+            ("The disk is full: the" if is_full else "The")
+            + f" checkpoint {str(path)!r} could not be written{reason}."
+            + (f" The last checkpoint, {str(kept)!r}, is intact." if kept is not None else "")
+            + (" Make room and resume with --agent.resume True." if is_full else "")
+        ) from error
 
 
 def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -205,15 +150,20 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
         with warnings.catch_warnings():
             # About pickle protocols, which say nothing to a user.
             warnings.simplefilter("ignore", UserWarning)
-            _compare_checksums(path)
+            # torch does not look whether the content of an archive is what was written.
+            if zipfile.is_zipfile(path):
+                with zipfile.ZipFile(path) as archive:
+                    if (damaged := archive.testzip()) is not None:
+                        raise zipfile.BadZipFile(f"the checksum of {damaged} is wrong")
             data = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         raise CheckpointError(_unpickling_message(path, error)) from error
     except Exception as error:
         # Damaged bytes make the reader fail in any way there is.
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:160]
         raise CheckpointError(
             f"The checkpoint {str(path)!r} is truncated or corrupt "
-            f"({path.stat().st_size} bytes; {_first_line(error)}). Use an earlier one."
+            f"({path.stat().st_size} bytes; {reason}). Use an earlier one."
         ) from error
     if not isinstance(data, dict):
         raise CheckpointError(
@@ -223,13 +173,16 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
     return data
 
 
-def _compare_checksums(path: Path) -> None:
-    """Raise BadZipFile if the content of an archive is not what was written; torch does not look."""
-    if not zipfile.is_zipfile(path):
-        return
-    with zipfile.ZipFile(path) as archive:
-        if (damaged := archive.testzip()) is not None:
-            raise zipfile.BadZipFile(f"the checksum of {damaged} is wrong")
+def latest_checkpoint(folder: Path) -> Path | None:
+    """Return the `model_<number>.pt` with the highest number in `folder`, or None."""
+    if not folder.is_dir():
+        return None
+    numbered = {
+        int(match.group(1)): path
+        for path in folder.iterdir()
+        if (match := re.fullmatch(r"model_(\d+)\.pt", path.name))
+    }
+    return numbered[max(numbered)] if numbered else None
 
 
 def learner_of_checkpoint(path: str | os.PathLike[str]) -> Learner:
@@ -242,6 +195,26 @@ def learner_of_checkpoint(path: str | os.PathLike[str]) -> Learner:
     if "student_state_dict" in checkpoint:
         return "distillation"
     return "sac" if _SAC_KEY in checkpoint else "ppo"
+
+
+def ensure_writable_folder(folder: str | os.PathLike[str]) -> Path:
+    """Make `folder` if it is missing, and write a file into it to see that this works.
+
+    Raises:
+        RunFolderError: the folder cannot be made or written to.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=folder, prefix=".write-test-") as file:
+            file.write(b"x")
+            file.flush()
+    except OSError as error:
+        raise RunFolderError(
+            f"The run folder {str(folder)!r} cannot be written to ({error.strerror or error}). "
+            "Choose another place with --log-root, or change its permissions."
+        ) from error
+    return folder
 
 
 def _missing_message(path: Path) -> str:
@@ -269,27 +242,357 @@ def _unpickling_message(path: Path, error: Exception) -> str:
     )
 
 
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:160]
+class RunRescue:
+    """Saves a run whose folder disappears, or in which an iteration fails.
+
+    A context around the iterations. Set `learned` to what the last finished iteration left, as
+    checkpoint entries: an error in the block saves that, unless there is a checkpoint of it.
+    """
+
+    learned: dict[str, Any] | None = None
+    """Entries of a checkpoint that resumes in new episodes; None: there is nothing to save."""
+
+    def __init__(self, folder: str | os.PathLike[str] | None) -> None:
+        """Take the run folder; None: this process writes no files."""
+        self._folder = None if folder is None else os.fspath(folder)
+        self._descriptor: int | None = None
+
+    def __enter__(self) -> RunRescue:
+        if self._folder is not None:
+            # Kept open, so that another folder of its name can be told from it. Windows opens no
+            # folders, and deletes none in which a file is open.
+            with contextlib.suppress(PermissionError):
+                self._descriptor = os.open(self._folder, os.O_RDONLY)
+        return self
+
+    def check_folder(self, save: Callable[[str], None], name: str) -> None:
+        """Save the run beside its folder, by `save(path)`, if that is gone.
+
+        Raises:
+            RunFolderError: the folder is gone; the message says where `name` is.
+        """
+        if self._descriptor is None or self._folder is None:
+            return
+        # The next writer, such as TensorBoard, creates another folder of that name.
+        with contextlib.suppress(OSError):
+            if os.path.samestat(os.fstat(self._descriptor), os.stat(self._folder)):
+                return
+        path = os.path.join(f"{os.path.normpath(self._folder)}_rescued", name)
+        save(path)
+        raise RunFolderError(
+            f"The run folder {self._folder!r} is no longer there: it was deleted or moved while the run "
+            f"was training. The run was saved to {path!r}, from which it resumes."
+        )
+
+    def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+        if self.learned is None or self._folder is None:
+            return
+        if not isinstance(error, Exception) or isinstance(error, (CheckpointError, RunFolderError)):
+            return
+        path = os.path.join(self._folder, f"model_{self.learned['iter']}.pt")
+        # Weights that are NaN may be why training failed, and could not be loaded again.
+        if os.path.exists(path) or not_finite(self.learned):
+            return
+        try:
+            save_checkpoint(self.learned, path)
+        except CheckpointError as failure:
+            # What failed first is what the user has to know.
+            logger.warning("%s", failure)
+            return
+        logger.warning(
+            "Training failed in iteration %d. Weights and optimizer of before are in %s; a run that is "
+            "resumed from there starts in new episodes.",
+            self.learned["iterations_finished"] + 1, path,
+        )  # fmt: skip
 
 
-# MERGED mjlab.rl.checkpoint: Older layouts of a checkpoint, brought to today's; and whether one fits the networks.
+# Networks and optimizer.
 
-_STD_NAMES = {
-    "std": "distribution.std_param",
-    "log_std": "distribution.log_std_param",
-}
 
-# The entries whose type is known, whoever wrote the file: a dict, or a number of iterations.
-_DICT_ENTRIES = (
-    "model_state_dict", "actor_state_dict", "critic_state_dict", "student_state_dict",
-    "teacher_state_dict", "optimizer_state_dict", "rnd_state_dict", "rnd_optimizer_state_dict",
-    "infos", "training_state",
-)  # fmt: skip
+def load_algorithm(
+    algorithm: Any,
+    checkpoint: dict[str, Any],
+    load_cfg: dict[str, bool] | None,
+    strict: bool,
+    path: str,
+) -> bool:
+    """Let rsl_rl load its parts of a migrated `checkpoint`, read from `path`.
 
-# Entries of learning, beside the networks.
-_LEARNING_ENTRIES = ("optimizer_state_dict", "rnd_optimizer_state_dict", "sac_state_dict")
-_COUNT_ENTRIES = {"iter": -1, "iterations_finished": 0, "last_evaluated": 0}
+    Args:
+        algorithm: rsl_rl's, or one with its methods.
+        checkpoint: What `migrate` returned.
+        load_cfg: Which parts to load; None loads all.
+        strict: Whether every parameter has to fit.
+        path: The file, for messages.
+
+    Returns:
+        Whether the count of iterations is to be loaded.
+
+    Raises:
+        CheckpointError: a part is missing, does not fit, or is not finite; nothing was changed then.
+    """
+    for name in ("actor", "critic", "student", "teacher"):
+        model = getattr(algorithm, f"_raw_{name}", None)
+        if strict and model is not None and (load_cfg is None or load_cfg.get(name)):
+            check_fits(model, checkpoint.get(f"{name}_state_dict"), name=name, path=path)
+    if load_cfg is None or load_cfg.get("optimizer"):
+        saved = checkpoint.get("optimizer_state_dict")
+        check_optimizer_fits(algorithm.optimizer, saved, path=path)
+        broken = not_finite({name: checkpoint.get(name) for name in _LEARNING_ENTRIES})
+        if broken:
+            raise CheckpointError(
+                f"The checkpoint {path!r} holds values that are NaN or infinite: {', '.join(broken)}. "
+                "Use an earlier one; nothing was changed."
+            )
+    # rsl_rl loads one part after the other, and what fits only in part is half loaded then.
+    before = copy.deepcopy(algorithm.save())
+    try:
+        return algorithm.load(checkpoint, load_cfg, strict)
+    except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
+        algorithm.load(before, None, True)
+        raise CheckpointError(
+            f"The checkpoint {path!r} does not fit this algorithm: {error}. To use its "
+            "policy only, load it with load_cfg={'actor': True}."
+        ) from error
+
+
+def check_fits(
+    model: torch.nn.Module, saved: Mapping[str, Any] | None, *, name: str, path: str
+) -> None:
+    """Check that the state dict `saved` fits `model`.
+
+    Raises:
+        CheckpointError: parameters are missing, unknown, of another shape, or NaN or infinite; all are
+            listed.
+    """
+    if saved is None:
+        raise CheckpointError(
+            f"The checkpoint {path!r} holds no {name} weights; use one that the same learner wrote."
+        )
+    own = model.state_dict()
+    expected = {key: tuple(value.shape) for key, value in own.items()}
+    found = {key: tuple(value.shape) for key, value in saved.items() if hasattr(value, "shape")}
+    if expected == found:
+        # What a network is built with, such as a mask of minus infinity, may be in its checkpoint.
+        broken = [key for key in own if not _is_finite(saved[key]) and _is_finite(own[key])]
+        if broken:
+            raise CheckpointError(
+                f"The checkpoint {path!r} holds {name} weights that are NaN or infinite: "
+                f"{', '.join(broken)}. Use an earlier one; nothing was changed."
+            )
+        return
+    lines = [
+        f"  {key}: expected {expected.get(key, 'nothing')}, found {found.get(key, 'nothing')}"
+        for key in sorted(expected.keys() | found.keys())
+        if expected.get(key) != found.get(key)
+    ]
+    raise CheckpointError(
+        f"The checkpoint {path!r} is of another network: its {name} does not fit this task's "
+        f"{name} config.\n" + "\n".join(lines) + "\nUse a checkpoint of this task, or make "
+        f"the network (--agent.{name}.) and the observations what they were when it was trained."
+    )
+
+
+def check_optimizer_fits(
+    optimizer: torch.optim.Optimizer, saved: Mapping[str, Any] | None, *, path: str
+) -> None:
+    """Check that the state `saved` is of as many parameters of the same shapes.
+
+    torch itself compares numbers of parameters only, and would fail at the next update.
+
+    Raises:
+        CheckpointError: it is not.
+    """
+    try:
+        fits = saved is not None and _optimizer_fits(optimizer, saved)
+    except (KeyError, TypeError, AttributeError):
+        fits = False
+    if not fits:
+        raise CheckpointError(
+            f"The checkpoint {path!r} holds no optimizer state for these networks. To use its "
+            "policy only, load it with load_cfg={'actor': True}; nothing was changed."
+        )
+
+
+def _optimizer_fits(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> bool:
+    groups = saved["param_groups"]
+    if len(groups) != len(optimizer.param_groups):
+        return False
+    for group, own in zip(groups, optimizer.param_groups, strict=True):
+        if len(group["params"]) != len(own["params"]) or not isinstance(group["lr"], float):
+            return False
+        # Switches of torch's optimizers; another release may have others.
+        switches = [name for name, value in own.items() if isinstance(value, bool)]
+        if not all(isinstance(group.get(name, False), bool) for name in switches):
+            return False
+        for number, parameter in zip(group["params"], own["params"], strict=True):
+            state = saved["state"].get(number)
+            if state is not None and not state:
+                # torch would begin with new moments, without a word.
+                return False
+            for value in (state or {}).values():
+                is_moment = isinstance(value, torch.Tensor) and value.dim() > 0
+                if is_moment and value.shape != parameter.shape:
+                    return False
+    return True
+
+
+def not_finite(value: Any, name: str = "") -> list[str]:
+    """Return the names of tensors within `value` that hold NaN, and of learning rates not finite."""
+    if isinstance(value, torch.Tensor):
+        return [name] if bool(value.isnan().any()) else []
+    if isinstance(value, float):
+        return [name] if name.endswith(".lr") and not math.isfinite(value) else []
+    if isinstance(value, dict):
+        items = value.items()
+    elif isinstance(value, (list, tuple)):
+        items = enumerate(value)
+    else:
+        return []
+    prefix = f"{name}." if name else ""
+    return [found for key, item in items for found in not_finite(item, f"{prefix}{key}")]
+
+
+def _is_finite(value: torch.Tensor) -> bool:
+    return bool(torch.isfinite(value).all())
+
+
+# Exact resume.
+
+
+def capture_training_state(
+    env: VecEnv, algorithm: Any, logger_state: dict[str, Any], observations: TensorDict
+) -> dict[str, Any]:
+    """Return the state between two iterations, `observations` being the ones to act on next."""
+    unwrapped: Any = getattr(env, "unwrapped", env)
+    hidden = [model.get_hidden_state() for model in _models(algorithm)]
+    state: dict[str, Any] = {
+        "version": VERSION,
+        "num_envs": env.num_envs,
+        "rng": rng_state(),
+        "observations": {key: value.clone() for key, value in _flat(observations).items()},
+        "logger": logger_state,
+        "hidden_states": [list(one) if isinstance(one, tuple) else one for one in hidden],
+        "rnd": None,
+    }
+    if (rnd := getattr(algorithm, "rnd", None)) is not None:
+        average = _reward_average(rnd)
+        state["rnd"] = {
+            "update_counter": rnd.update_counter,
+            "discounted_average": None if average is None else average.avg,
+        }
+    if hasattr(unwrapped, "state_dict"):
+        state["env"] = unwrapped.state_dict()
+    return state
+
+
+def restore_training_state(
+    state: dict[str, Any],
+    env: VecEnv,
+    algorithm: Any,
+    load_logger: Callable[[dict[str, Any]], None],
+    device: str | torch.device,
+) -> TensorDict:
+    """Restore what `capture_training_state` returned, and return the observations to act on next.
+
+    Args:
+        state: What was captured.
+        env: The environments.
+        algorithm: rsl_rl's, or one with its methods, on `device`.
+        load_logger: Takes the state of the logger.
+        device: Device of the networks.
+
+    Raises:
+        ValueError: the state is of other environments; nothing was changed then.
+        CheckpointError: the state is malformed.
+    """
+    try:
+        observations = _matching_observations(state, env)
+        unwrapped: Any = getattr(env, "unwrapped", env)
+        if "env" in state and hasattr(unwrapped, "load_state_dict"):
+            # Tensors that the rollout made can only be written to in this mode.
+            with torch.inference_mode():
+                unwrapped.load_state_dict(_to(state["env"], env.device))
+        load_logger(state["logger"])
+        for model, hidden in zip(_models(algorithm), state["hidden_states"], strict=True):
+            if hidden is not None:
+                hidden = _to(hidden, device)
+                model.reset(hidden_state=tuple(hidden) if isinstance(hidden, list) else hidden)
+        if hasattr(algorithm, "last_hidden_states"):
+            # Of rsl_rl's distillation, which begins an update with those before the iteration.
+            algorithm.last_hidden_states = (algorithm.student.get_hidden_state(), None)
+        rnd = getattr(algorithm, "rnd", None)
+        if rnd is not None and state["rnd"] is not None:
+            rnd.update_counter = state["rnd"]["update_counter"]
+            if (average := _reward_average(rnd)) is not None:
+                average.avg = _to(state["rnd"]["discounted_average"], device)
+        observations = observations.to(device)
+        # Last, because restoring may have drawn random numbers.
+        set_rng_state(state["rng"])
+        return observations
+    except torch.OutOfMemoryError:
+        raise
+    except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
+        raise CheckpointError(
+            f"The checkpoint's training_state is malformed ({type(error).__name__}: {error}). Use an "
+            "earlier checkpoint, or load only its networks with load_cfg={'actor': True, 'critic': True}."
+        ) from error
+
+
+def _matching_observations(state: dict[str, Any], env: VecEnv) -> TensorDict:
+    """Return the observations of `state`; raise ValueError if it is of other environments."""
+    if state.get("version") != VERSION:
+        raise ValueError(f"It was saved in format {state.get('version')}, not {VERSION}.")
+    if state["num_envs"] != env.num_envs:
+        raise ValueError(
+            f"It is of {state['num_envs']} environments and this run has {env.num_envs}; give "
+            f"--num-envs {state['num_envs']}."
+        )
+    observations = TensorDict({}, batch_size=[env.num_envs])
+    for key, value in state["observations"].items():
+        observations.set(tuple(key.split("\n")), value)
+    found, expected = (
+        {key: tuple(value.shape) for key, value in _flat(one).items()}
+        for one in (observations, env.get_observations())
+    )
+    if found != expected:
+        raise ValueError(f"Its observations are {found}, and this run's {expected}.")
+    return observations
+
+
+def _flat(observations: TensorDict) -> dict[str, torch.Tensor]:
+    """Return the tensors by name; names of nested ones are joined by a newline."""
+    return {
+        "\n".join(key) if isinstance(key, tuple) else key: observations.get(key)
+        for key in observations.keys(include_nested=True, leaves_only=True)
+    }
+
+
+def _models(algorithm: Any) -> list[Any]:
+    names = ("actor", "critic", "student", "teacher")
+    return [getattr(algorithm, name) for name in names if hasattr(algorithm, name)]
+
+
+def _reward_average(rnd: Any) -> Any:
+    """Return the discounted average of the reward normalizer of RND; None without one."""
+    return getattr(getattr(rnd, "reward_normalizer", None), "disc_avg", None)
+
+
+def _to(value: Any, device: Any) -> Any:
+    """Move all tensors within dicts and lists to `device`."""
+    if isinstance(value, torch.Tensor):
+        return value.to(device)
+    if isinstance(value, dict):
+        return {key: _to(item, device) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(_to(item, device) for item in value)
+    return value
+
+
+# Older layouts.
 
 
 def migrate(checkpoint: Mapping[str, Any], path: str = "") -> dict[str, Any]:
@@ -304,7 +607,14 @@ def migrate(checkpoint: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     _check_types(checkpoint, path)
     migrated = dict(checkpoint)
     if migrated.get("model_state_dict") is not None:
-        migrated.update(_split_single_model(migrated.pop("model_state_dict")))
+        parts: dict[str, dict[str, Any]] = {"actor_state_dict": {}, "critic_state_dict": {}}
+        for name, value in migrated.pop("model_state_dict").items():
+            if name in _STD_NAMES:
+                parts["actor_state_dict"][name] = value
+            for prefix, (part, today) in _SINGLE_MODEL_PREFIXES.items():
+                if name.startswith(prefix):
+                    parts[part][today + name.removeprefix(prefix)] = value
+        migrated.update(parts)
     if migrated.get("actor_state_dict") is not None:
         migrated["actor_state_dict"] = {
             _STD_NAMES.get(name, name): value
@@ -353,278 +663,43 @@ def _malformed(path: str, name: str, allowed: str, value: Any) -> CheckpointErro
     )
 
 
-def _split_single_model(model: Mapping[str, torch.Tensor]) -> dict[str, Any]:
-    prefixes = {
-        "actor.": ("actor_state_dict", "mlp."),
-        "actor_obs_normalizer.": ("actor_state_dict", "obs_normalizer."),
-        "critic.": ("critic_state_dict", "mlp."),
-        "critic_obs_normalizer.": ("critic_state_dict", "obs_normalizer."),
-    }
-    split: dict[str, dict[str, torch.Tensor]] = {"actor_state_dict": {}, "critic_state_dict": {}}
-    for name, value in model.items():
-        if name in _STD_NAMES:
-            split["actor_state_dict"][name] = value
-        for prefix, (part, today) in prefixes.items():
-            if name.startswith(prefix):
-                split[part][today + name.removeprefix(prefix)] = value
-    return split
+# Plain data.
 
 
-def check_fits(
-    model: torch.nn.Module, saved: Mapping[str, Any] | None, *, name: str, path: str
-) -> None:
-    """Check that the state dict `saved` fits `model`.
+def as_plain_data(value: Any, path: str = "") -> Any:
+    """Return `value` with numpy's scalars as Python's; containers without any are returned as is.
+
+    Args:
+        value: Tensors, numbers, strings, None, and dicts, lists, tuples and sets of those.
+        path: Where in a file `value` is to be, for the message.
 
     Raises:
-        CheckpointError: parameters are missing, unknown, of another shape, or NaN or infinite; all are
-            listed.
+        TypeError: something else is in there; the message says where and of which type.
     """
-    if saved is None:
-        raise CheckpointError(
-            f"The checkpoint {path!r} holds no {name} weights; use one that the same learner wrote."
+    if isinstance(value, np.generic):
+        value = value.item()
+    kind = type(value)
+    if kind in _ATOMS:
+        return value
+    if kind in _SEQUENCES:
+        items = [as_plain_data(item, f"{path}[{index}]") for index, item in enumerate(value)]
+        same = all(one is other for one, other in zip(items, value, strict=True))
+        return value if same else kind(items)
+    if kind not in _DICTS:
+        raise TypeError(f"{path or 'it'} is a {kind.__module__}.{kind.__qualname__}")
+    entries = {
+        as_plain_data(key, f"a key of {path or 'it'}"): as_plain_data(
+            item, f"{path}.{key}" if path else str(key)
         )
-    own = model.state_dict()
-    expected = {key: tuple(value.shape) for key, value in own.items()}
-    found = {key: tuple(value.shape) for key, value in saved.items() if hasattr(value, "shape")}
-    if expected == found:
-        # What a network is built with, such as a mask of minus infinity, may be in its checkpoint.
-        broken = [key for key in own if not _is_finite(saved[key]) and _is_finite(own[key])]
-        if broken:
-            raise CheckpointError(
-                f"The checkpoint {path!r} holds {name} weights that are NaN or infinite: "
-                f"{', '.join(broken)}. Use an earlier one; nothing was changed."
-            )
-        return
-    lines = [
-        f"  {key}: expected {expected.get(key, 'nothing')}, found {found.get(key, 'nothing')}"
-        for key in sorted(expected.keys() | found.keys())
-        if expected.get(key) != found.get(key)
-    ]
-    raise CheckpointError(
-        f"The checkpoint {path!r} is of another network: its {name} does not fit this task's "
-        f"{name} config.\n" + "\n".join(lines) + "\nUse a checkpoint of this task, or make "
-        f"the network (--agent.{name}.) and the observations what they were when it was trained."
-    )
-
-
-def _is_finite(value: torch.Tensor) -> bool:
-    return bool(torch.isfinite(value).all())
-
-
-def check_optimizer_fits(
-    optimizer: torch.optim.Optimizer, saved: Mapping[str, Any] | None, *, path: str
-) -> None:
-    """Check that the state `saved` is of as many parameters of the same shapes.
-
-    torch itself compares numbers of parameters only, and would fail at the next update.
-
-    Raises:
-        CheckpointError: it is not.
-    """
-    try:
-        fits = saved is not None and _optimizer_fits(optimizer, saved)
-    except (KeyError, TypeError, AttributeError):
-        fits = False
-    if not fits:
-        raise CheckpointError(
-            f"The checkpoint {path!r} holds no optimizer state for these networks. To use its "
-            "policy only, load it with load_cfg={'actor': True}; nothing was changed."
-        )
-
-
-def check_finite(checkpoint: Mapping[str, Any], path: str) -> None:
-    """Check the states of optimizers and of SAC.
-
-    Raises:
-        CheckpointError: tensors are NaN, or learning rates not finite.
-    """
-    broken = not_finite({name: checkpoint.get(name) for name in _LEARNING_ENTRIES})
-    if broken:
-        raise CheckpointError(
-            f"The checkpoint {path!r} holds values that are NaN or infinite: {', '.join(broken)}. "
-            "Use an earlier one; nothing was changed."
-        )
-
-
-def not_finite(value: Any, name: str = "") -> list[str]:
-    """Return the names of tensors within `value` that hold NaN, and of learning rates not finite."""
-    if isinstance(value, torch.Tensor):
-        return [name] if bool(value.isnan().any()) else []
-    if isinstance(value, float):
-        return [name] if name.endswith(".lr") and not math.isfinite(value) else []
-    if isinstance(value, dict):
-        items = value.items()
-    elif isinstance(value, (list, tuple)):
-        items = enumerate(value)
-    else:
-        return []
-    prefix = f"{name}." if name else ""
-    return [found for key, item in items for found in not_finite(item, f"{prefix}{key}")]
-
-
-def _optimizer_fits(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> bool:
-    groups = saved["param_groups"]
-    if len(groups) != len(optimizer.param_groups):
-        return False
-    for group, own in zip(groups, optimizer.param_groups, strict=True):
-        if len(group["params"]) != len(own["params"]) or not isinstance(group["lr"], float):
-            return False
-        # Switches of torch's optimizers; another release may have others.
-        switches = [name for name, value in own.items() if isinstance(value, bool)]
-        if not all(isinstance(group.get(name, False), bool) for name in switches):
-            return False
-        for number, parameter in zip(group["params"], own["params"], strict=True):
-            state = saved["state"].get(number)
-            if state is not None and not state:
-                # torch would begin with new moments, without a word.
-                return False
-            for value in (state or {}).values():
-                is_moment = isinstance(value, torch.Tensor) and value.dim() > 0
-                if is_moment and value.shape != parameter.shape:
-                    return False
-    return True
-
-
-# MERGED mjlab.rl.checkpoint: What exact resume needs beyond the networks: environments, generators, clocks.
-#
-# Everything is plain data, so that a checkpoint loads with `weights_only=True`.
-
-VERSION = 1
-
-
-def capture(
-    env: VecEnv, algorithm: Any, run_logger: RunLogger, observations: TensorDict
-) -> dict[str, Any]:
-    """Return the state between two iterations, `observations` being the ones to act on next."""
-    unwrapped: Any = getattr(env, "unwrapped", env)
-    state: dict[str, Any] = {
-        "version": VERSION,
-        "num_envs": env.num_envs,
-        "rng": rng_state(),
-        "observations": {key: value.clone() for key, value in _flat(observations).items()},
-        "logger": run_logger.state_dict(),
-        "hidden_states": [_hidden_state(model) for model in _models(algorithm)],
-        "rnd": _rnd_state(getattr(algorithm, "rnd", None)),
+        for key, item in value.items()
     }
-    if hasattr(unwrapped, "state_dict"):
-        state["env"] = unwrapped.state_dict()
-    return state
-
-
-def restore(
-    state: dict[str, Any], env: VecEnv, algorithm: Any, run_logger: RunLogger
-) -> TensorDict:
-    """Restore what `capture` returned, and return the observations to act on next.
-
-    Raises:
-        ValueError: the state is of other environments; nothing was changed then.
-        CheckpointError: the state is malformed.
-    """
-    try:
-        return _restore(state, env, algorithm, run_logger)
-    except torch.OutOfMemoryError:
-        raise
-    except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
-        raise CheckpointError(
-            f"The checkpoint's training_state is malformed ({type(error).__name__}: {error}). Use an "
-            "earlier checkpoint, or load only its networks with load_cfg={'actor': True, 'critic': True}."
-        ) from error
-
-
-def _restore(
-    state: dict[str, Any], env: VecEnv, algorithm: Any, run_logger: RunLogger
-) -> TensorDict:
-    if state.get("version") != VERSION:
-        raise ValueError(f"It was saved in format {state.get('version')}, not {VERSION}.")
-    if state["num_envs"] != env.num_envs:
-        raise ValueError(
-            f"It is of {state['num_envs']} environments and this run has {env.num_envs}; give "
-            f"--num-envs {state['num_envs']}."
-        )
-    observations = _unflat(state["observations"], env.num_envs)
-    expected = env.get_observations()
-    if _shapes(observations) != _shapes(expected):
-        raise ValueError(
-            f"Its observations are {_shapes(observations)}, and this run's {_shapes(expected)}."
-        )
-    unwrapped: Any = getattr(env, "unwrapped", env)
-    if "env" in state and hasattr(unwrapped, "load_state_dict"):
-        # Tensors that the rollout made can only be written to in this mode.
-        with torch.inference_mode():
-            unwrapped.load_state_dict(_to(state["env"], env.device))
-    device = run_logger.device
-    run_logger.load_state_dict(state["logger"])
-    for model, hidden in zip(_models(algorithm), state["hidden_states"], strict=True):
-        if hidden is not None:
-            model.reset(hidden_state=_as_tuples(_to(hidden, device)))
-    if hasattr(algorithm, "last_hidden_states"):
-        # Of rsl_rl's distillation, which begins an update with those before the iteration.
-        algorithm.last_hidden_states = (algorithm.student.get_hidden_state(), None)
-    _restore_rnd(getattr(algorithm, "rnd", None), state["rnd"], device)
-    observations = observations.to(device)
-    # Last, because restoring may have drawn random numbers.
-    set_rng_state(state["rng"])
-    return observations
-
-
-def _models(algorithm: Any) -> list[Any]:
-    names = ("actor", "critic", "student", "teacher")
-    return [getattr(algorithm, name) for name in names if hasattr(algorithm, name)]
-
-
-def _hidden_state(model: Any) -> Any:
-    hidden = model.get_hidden_state()
-    return list(hidden) if isinstance(hidden, tuple) else hidden
-
-
-def _as_tuples(hidden: Any) -> Any:
-    return tuple(hidden) if isinstance(hidden, list) else hidden
-
-
-def _rnd_state(rnd: Any) -> dict[str, Any] | None:
-    if rnd is None:
-        return None
-    average = getattr(getattr(rnd, "reward_normalizer", None), "disc_avg", None)
-    return {
-        "update_counter": rnd.update_counter,
-        "discounted_average": None if average is None else average.avg,
-    }
-
-
-def _restore_rnd(rnd: Any, state: dict[str, Any] | None, device: Any) -> None:
-    if rnd is None or state is None:
-        return
-    rnd.update_counter = state["update_counter"]
-    average = getattr(getattr(rnd, "reward_normalizer", None), "disc_avg", None)
-    if average is not None:
-        average.avg = _to(state["discounted_average"], device)
-
-
-def _flat(observations: TensorDict) -> dict[str, torch.Tensor]:
-    """Return the tensors by name; names of nested ones are joined by a newline."""
-    return {
-        "\n".join(key) if isinstance(key, tuple) else key: observations.get(key)
-        for key in observations.keys(include_nested=True, leaves_only=True)
-    }
-
-
-def _shapes(observations: TensorDict) -> dict[str, tuple[int, ...]]:
-    return {key: tuple(value.shape) for key, value in _flat(observations).items()}
-
-
-def _unflat(tensors: dict[str, torch.Tensor], num_envs: int) -> TensorDict:
-    observations = TensorDict({}, batch_size=[num_envs])
-    for key, value in tensors.items():
-        observations.set(tuple(key.split("\n")), value)
-    return observations
-
-
-def _to(value: Any, device: Any) -> Any:
-    """Move all tensors within dicts and lists to `device`."""
-    if isinstance(value, torch.Tensor):
-        return value.to(device)
-    if isinstance(value, dict):
-        return {key: _to(item, device) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return type(value)(_to(item, device) for item in value)
-    return value
+    if all(
+        key is other and entries[key] is value[other]
+        for key, other in zip(entries, value, strict=True)
+    ):
+        return value
+    # A copy and not a new dict, because state dicts of modules carry versions as an attribute.
+    plain = copy.copy(value)
+    plain.clear()
+    plain.update(entries)
+    return plain

@@ -10,6 +10,7 @@ import mujoco
 import torch
 
 from mjlab.sim.divergence import cure_of, describe_dof, fastest_dof
+from mjlab.utils.errors import MjlabError
 
 # Terms may be NaN in the first step of all episodes, and iterations of SAC are short.
 _MIN_BROKEN_STEPS = 16
@@ -17,11 +18,11 @@ _MIN_BROKEN_STEPS = 16
 _MIN_DIVERGED_EPISODES = 4
 
 
-class DivergedError(RuntimeError):
+class DivergedError(MjlabError, RuntimeError):
     """Training failed because the physics of a joint diverged."""
 
 
-class BrokenTermError(ValueError):
+class BrokenTermError(MjlabError, ValueError):
     """A reward or a termination was NaN or infinite in every environment for a whole iteration."""
 
 

@@ -33,7 +33,7 @@ import hashlib
 import io
 import logging
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,6 +48,33 @@ if TYPE_CHECKING:
 Metadata = dict[str, list | str | float]
 DIGEST_KEY = "initializers_sha256"
 logger = logging.getLogger(__name__)
+
+
+def export_with_metadata(
+    write: Callable[[str, str], None], metadata: Callable[[], Metadata], path: str
+) -> bool:
+    """Write a policy as ONNX with all that a deployment needs to know; return whether it was written.
+
+    Failures are logged: a run is not lost because its policy has no ONNX form.
+
+    Args:
+        write: Called as `write(folder, filename)`.
+        metadata: Returns the metadata.
+        path: The file.
+    """
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        write(str(target.parent), target.name)
+    except Exception as error:
+        logger.warning("The policy was not exported to %s: %s", path, error)
+        return False
+    try:
+        digest = {DIGEST_KEY: initializers_digest(path)}
+        attach_metadata_to_onnx(path, {**metadata(), **digest})
+    except Exception as error:
+        logger.warning("The exported policy %s is without metadata: %s", path, error)
+    return True
 
 
 def list_to_csv_str(

@@ -13,6 +13,7 @@ from mjlab.rl.config import (
     RslRlOffPolicyRunnerCfg,
     RslRlOnPolicyRunnerCfg,
 )
+from mjlab.utils.errors import check_exists
 
 Learner = Literal["ppo", "sac", "distillation"]
 LEARNERS: tuple[Learner, ...] = get_args(Learner)
@@ -24,8 +25,7 @@ _PACE = frozenset(("num_steps_per_env", "max_iterations", "save_interval"))
 
 def check_learner(name: str) -> None:
     """Raise ValueError, listing the learners, unless `name` is one."""
-    if name not in LEARNERS:
-        raise ValueError(f"Unknown learner {name!r}. Available: {', '.join(LEARNERS)}.")
+    check_exists("learner", name, LEARNERS)
 
 
 def learner_of(cfg: RslRlBaseRunnerCfg) -> Learner:
@@ -54,7 +54,16 @@ def with_learner(cfg: RslRlBaseRunnerCfg, learner: Learner) -> RslRlBaseRunnerCf
         return _distillation(cfg, base)
     symmetry = getattr(getattr(cfg, "algorithm", None), "symmetry_cfg", None)
     if learner == "sac":
-        _check_networks_are_plain(cfg)
+        for name in ("actor", "critic"):
+            for field, kind in (
+                ("rnn_type", "a recurrent one"),
+                ("cnn_cfg", "one that sees images"),
+            ):
+                if getattr(getattr(cfg, name, None), field, None):
+                    raise ValueError(
+                        f"agent.{name}: expected a network of flat observations for the learner 'sac', "
+                        f"got {kind} ({field}); use --learner ppo."
+                    )
         off_policy = RslRlOffPolicyRunnerCfg(**base)
         if symmetry:
             off_policy.algorithm.symmetry_cfg = {_MIRROR_FUNCTION: symmetry[_MIRROR_FUNCTION]}
@@ -114,13 +123,3 @@ def acting_cfg(cfg: RslRlBaseRunnerCfg) -> dict[str, Any]:
     if learner_of(cfg) == "sac":
         acting["algorithm"]["replay_steps"] = 1
     return acting
-
-
-def _check_networks_are_plain(cfg: RslRlBaseRunnerCfg) -> None:
-    for name in ("actor", "critic"):
-        for field, kind in (("rnn_type", "a recurrent one"), ("cnn_cfg", "one that sees images")):
-            if getattr(getattr(cfg, name, None), field, None):
-                raise ValueError(
-                    f"agent.{name}: expected a network of flat observations for the learner 'sac', "
-                    f"got {kind} ({field}); use --learner ppo."
-                )

@@ -1,4 +1,7 @@
-"""TODO."""
+"""Networks of a run: checks against the observations, settings completed, image encoders shared.
+
+rsl_rl would fail on most of what is checked here too, but later and without naming the setting.
+"""
 
 from __future__ import annotations
 
@@ -11,19 +14,49 @@ import torch
 
 from mjlab.rl.rsl import CNN, PPO, CNNModel, MLPModel, RNNModel, TensorDict, resolve_callable
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
-
-# MERGED mjlab.rl.networks: Whether the networks of a run can take the observations that its config gives them.
+from mjlab.rl.spatial_softmax import SPATIAL_SOFTMAX_KEYS, cnn_cfg_by_group
+from mjlab.utils.errors import check_positive
 
 _MODELS = ("actor", "critic", "student", "teacher")
 _SAC_MODELS = {"actor": SacActorModel, "critic": TwinCriticModel}
-
-# Keys of a CNN config that are not for rsl_rl's CNN.
-_SPATIAL_SOFTMAX_KEYS = ("spatial_softmax", "spatial_softmax_temperature")
-_EXAMPLE = (
+_RECURRENT_KEYS = ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")
+_CNN_EXAMPLE = (
     "class_name='CNNModel' or 'mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel', with "
     "cnn_cfg={'output_channels': [16, 32], 'kernel_size': [5, 3], 'stride': [2, 2], "
     "'padding': 'zeros'}"
 )
+_SYMMETRY_FUNCTION = "data_augmentation_func"
+_SYMMETRY_KEYS = {
+    _SYMMETRY_FUNCTION, "use_data_augmentation", "use_mirror_loss", "mirror_loss_coeff"
+}  # fmt: skip
+_SYMMETRY_EXAMPLE = (
+    'An example is {"data_augmentation_func": "mjlab.tasks.velocity.symmetry:mirror_left_right", '
+    '"use_data_augmentation": True}; None is without.'
+)
+
+
+def prepare_train_cfg(env: Any, cfg: dict[str, Any]) -> None:
+    """Check a runner's config against the observations of `env`, and complete it in place.
+
+    Args:
+        env: The environments, as rsl_rl's `VecEnv`.
+        cfg: A `RslRlOnPolicyRunnerCfg` as a dict.
+
+    Raises:
+        ValueError: see `check_networks` and `check_symmetry`.
+    """
+    # rsl_rl's constructors take these only if they are used.
+    for name in _MODELS:
+        model = cfg.get(name)
+        if isinstance(model, dict):
+            unused = [key for key in ("cnn_cfg", "distribution_cfg") if model.get(key, ...) is None]
+            unused += _RECURRENT_KEYS if model.get("rnn_type", ...) is None else ()
+            for key in unused:
+                model.pop(key, None)
+    observations = env.get_observations()
+    check_networks(observations, cfg)
+    _complete_image_settings(observations, cfg)
+    check_symmetry(env, observations, cfg)
 
 
 def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
@@ -45,12 +78,19 @@ def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
             "gaussian_distribution(0.1), whose deviation is that of the actions while learning."
         )
     shared = bool(cfg["algorithm"].get("share_cnn_encoders"))
-    images = {}
-    for model in _MODELS:
-        if isinstance(cfg.get(model), dict):
-            images[model] = _check_model(observations, cfg, model, shared)
-    if shared:
-        _check_sharing(images)
+    images = {
+        model: _check_model(observations, cfg, model, shared)
+        for model in _MODELS
+        if isinstance(cfg.get(model), dict)
+    }
+    actor, critic = images.get("actor"), images.get("critic")
+    if shared and (actor is None or critic is None or set(actor) != set(critic)):
+        raise ValueError(
+            "algorithm.share_cnn_encoders is True, so actor and critic need image encoders for the "
+            f"same groups; the actor has them for {list(actor or ()) or 'none'}, the critic for "
+            f"{list(critic or ()) or 'none'}. Give both the same image groups in obs_groups and a "
+            "CNN class, or set share_cnn_encoders=False."
+        )
     for model in images:
         settings = cfg[model]
         is_blind = resolve_callable(settings["class_name"]) in (MLPModel, RNNModel)
@@ -80,6 +120,62 @@ def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:
             f"agent.algorithm num_mini_batches: expected 1 to {most} ({of}{why}), got {parts}; use "
             "fewer mini-batches, or more environments."
         )
+
+
+def check_symmetry(env: Any, observations: Any, cfg: Mapping[str, Any]) -> None:
+    """Let the function of `symmetry_cfg` mirror the observations once.
+
+    Args:
+        env: The environments.
+        observations: Their observations, a TensorDict of batch size (N,).
+        cfg: A `RslRlOnPolicyRunnerCfg` as a dict.
+
+    Raises:
+        ValueError: a setting is missing or unknown, the function does not exist, or it does not
+            return the given rows and as many or more mirrored ones.
+    """
+    symmetry = cfg["algorithm"].get("symmetry_cfg")
+    if not symmetry:
+        return
+    if _SYMMETRY_FUNCTION not in symmetry or not set(symmetry) <= _SYMMETRY_KEYS:
+        raise ValueError(
+            f"symmetry_cfg has {', '.join(map(str, symmetry))}; it needs {_SYMMETRY_FUNCTION}, and may have "
+            f"{', '.join(sorted(_SYMMETRY_KEYS - {_SYMMETRY_FUNCTION}))}. {_SYMMETRY_EXAMPLE}"
+        )
+    try:
+        function = resolve_callable(symmetry[_SYMMETRY_FUNCTION])
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"symmetry_cfg names the function {symmetry[_SYMMETRY_FUNCTION]!r}, which cannot be imported: "
+            f"{error}. {_SYMMETRY_EXAMPLE}"
+        ) from error
+    actions = torch.zeros(env.num_envs, env.num_actions, device=env.device)
+    mirrored, mirrored_actions = function(env=env, obs=observations, actions=actions)
+    rows, action_rows = mirrored.batch_size[0], mirrored_actions.shape[0]
+    if rows != action_rows or rows < 2 * env.num_envs or rows % env.num_envs:
+        raise ValueError(
+            f"The function {symmetry[_SYMMETRY_FUNCTION]!r} of symmetry_cfg returned {rows} observations and "
+            f"{action_rows} actions for {env.num_envs} environments; it has to return the given ones "
+            "and as many mirror images of all of them."
+        )
+
+
+@contextlib.contextmanager
+def shared_parameters_allowed() -> Generator[None]:
+    """Let rsl_rl hand parameters of shared encoders to its optimizer twice; see `deduplicate_parameters`."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*duplicate parameters")
+        yield
+
+
+def deduplicate_parameters(optimizer: torch.optim.Optimizer) -> None:
+    """Make `optimizer`, before its first step, change each parameter once a step.
+
+    rsl_rl gives it the parameters of the actor and those of the critic, hence those of encoders
+    that both share twice, and each step would move them twice by the same gradient.
+    """
+    for group in optimizer.param_groups:
+        group["params"] = list(dict.fromkeys(group["params"]))
 
 
 def _check_sac_models(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
@@ -115,7 +211,7 @@ def _check_model(
     groups = {name: observations[name] for name in given if name in observations}
     for name, value in groups.items():
         _check_group(name, value)
-    images = tuple(name for name, value in groups.items() if value.ndim == 4)
+    images = {name: value for name, value in groups.items() if value.ndim == 4}
     kind = resolve_callable(cfg[model]["class_name"])
     if isinstance(kind, type) and issubclass(kind, CNNModel):
         if groups and not images:
@@ -126,16 +222,16 @@ def _check_model(
                 f"obs_groups[{model!r}]."
             )
         if model != "critic" or not shared:
-            cnn_cfg = cfg[model].get("cnn_cfg")
-            _check_encoders(model, kind, cnn_cfg, {n: groups[n] for n in images})
-        return images
+            _check_encoders(model, kind, cfg[model].get("cnn_cfg"), images)
+        return tuple(images)
     # Models of other packages may take what they like.
     if images and getattr(kind, "_get_obs_dim", None) is MLPModel._get_obs_dim:
+        first = next(iter(images))
         raise ValueError(
             f"The {model} (class_name {cfg[model]['class_name']!r}) takes flat observations only, "
-            f"and its observation group {images[0]!r} holds images of shape "
-            f"{tuple(groups[images[0]].shape[1:])}. Give it an image encoder ({_EXAMPLE}), or "
-            f"take {images[0]!r} out of obs_groups[{model!r}]."
+            f"and its observation group {first!r} holds images of shape "
+            f"{tuple(images[first].shape[1:])}. Give it an image encoder ({_CNN_EXAMPLE}), or "
+            f"take {first!r} out of obs_groups[{model!r}]."
         )
     return None
 
@@ -160,143 +256,46 @@ def _check_group(name: str, value: Any) -> None:
 
 
 def _check_encoders(model: str, kind: type, cnn_cfg: Any, images: dict[str, torch.Tensor]) -> None:
-    if not cnn_cfg:
-        raise ValueError(f"The {model} sees images {list(images)} and has no cnn_cfg. {_EXAMPLE}")
-    if not isinstance(cnn_cfg, dict):
-        raise ValueError(f"The {model}'s cnn_cfg is {cnn_cfg!r}; it has to be a dict. {_EXAMPLE}")
-    by_group = all(isinstance(value, dict) for value in cnn_cfg.values())
-    if by_group and set(cnn_cfg) != set(images):
+    """Build each encoder of `model` once, without memory."""
+    name = f"agent.{model} cnn_cfg"
+    if not cnn_cfg or not isinstance(cnn_cfg, dict):
         raise ValueError(
-            f"The {model}'s cnn_cfg has configs for {sorted(cnn_cfg)}, and its image groups are "
-            f"{sorted(images)}; give one for each, or one for all."
+            f"{name}: expected a dict for the images {list(images)}, got {cnn_cfg!r}. {_CNN_EXAMPLE}"
         )
-    for name, value in images.items():
-        own = cnn_cfg[name] if by_group else cnn_cfg
-        _check_spatial_softmax(model, kind, own)
-        settings = {k: v for k, v in own.items() if k not in _SPATIAL_SOFTMAX_KEYS}
+    for group, settings in cnn_cfg_by_group(cnn_cfg, list(images), name).items():
+        extra = [key for key in SPATIAL_SOFTMAX_KEYS if key in settings]
+        if extra and kind is CNNModel:
+            raise ValueError(
+                f"{name} has {extra}, and class_name='CNNModel' has no spatial softmax. Take them "
+                "out, or use class_name='mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel'."
+            )
+        temperature = settings.get("spatial_softmax_temperature", 1.0)
+        check_positive(f"{name} spatial_softmax_temperature", temperature)
+        settings = {k: v for k, v in settings.items() if k not in SPATIAL_SOFTMAX_KEYS}
+        shape = tuple(images[group].shape[1:])
         try:
             # On the meta device nothing is computed and no random number is drawn.
             with torch.device("meta"):
-                _, channels, height, width = value.shape
-                encoder = CNN((height, width), channels, **settings)
-                encoder(torch.empty(1, *value.shape[1:]))
+                channels, height, width = shape
+                CNN((height, width), channels, **settings)(torch.empty(1, *shape))
         except (RuntimeError, TypeError, ValueError, IndexError, KeyError) as error:
             raise ValueError(
-                f"The {model}'s cnn_cfg makes no encoder for the images {name!r} of shape "
-                f"{tuple(value.shape[1:])}: {str(error).splitlines()[0]}. The settings are "
-                f"{settings}; images have to be large enough for all layers."
+                f"{name} makes no encoder for the images {group!r} of shape {shape}: "
+                f"{str(error).splitlines()[0]}. The settings are {settings}; images have to be "
+                "large enough for all layers."
             ) from error
 
 
-def _check_spatial_softmax(model: str, kind: type, settings: dict[str, Any]) -> None:
-    extra = [name for name in _SPATIAL_SOFTMAX_KEYS if name in settings]
-    if extra and kind is CNNModel:
-        raise ValueError(
-            f"The {model}'s cnn_cfg has {extra}, and class_name='CNNModel' has no spatial softmax. "
-            "Take them out, or use class_name='mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel'."
-        )
-    temperature = settings.get("spatial_softmax_temperature", 1.0)
-    if not (isinstance(temperature, (int, float)) and temperature > 0.0):
-        raise ValueError(
-            f"The {model}'s cnn_cfg has spatial_softmax_temperature={temperature!r}; it has to be a "
-            "positive number."
-        )
-
-
-def _check_sharing(images: Mapping[str, tuple[str, ...] | None]) -> None:
-    actor, critic = images.get("actor"), images.get("critic")
-    if actor is None or critic is None or set(actor) != set(critic):
-        raise ValueError(
-            "algorithm.share_cnn_encoders is True, so actor and critic need image encoders for the "
-            f"same groups; the actor has them for {_listed(actor)}, the critic for "
-            f"{_listed(critic)}. Give both the same image groups in obs_groups and a CNN class, or "
-            "set share_cnn_encoders=False."
-        )
-
-
-def _listed(groups: tuple[str, ...] | None) -> str:
-    return "none" if not groups else str(list(groups))
-
-
-# MERGED mjlab.rl.networks: What networks with image encoders need beyond rsl_rl: settings that fit, and encoders shared.
-
-
-def settle_image_settings(observations: TensorDict, cfg: dict[str, Any]) -> None:
+def _complete_image_settings(observations: TensorDict, cfg: dict[str, Any]) -> None:
     """Edit a runner's config, in place, where rsl_rl would fail on settings without effect.
 
     A network that sees images only has nothing to normalize, since images never are. A critic that
     shares the actor's encoders needs no settings for its own.
     """
-    for model in ("actor", "critic", "student", "teacher"):
+    for model in _MODELS:
         groups = (cfg.get("obs_groups") or {}).get(model, ())
         known = [observations[name] for name in groups if name in observations]
         if cfg.get(model) and known and all(value.ndim == 4 for value in known):
             cfg[model]["obs_normalization"] = False
     if cfg["algorithm"].get("share_cnn_encoders"):
         cfg["critic"].setdefault("cnn_cfg", cfg["actor"].get("cnn_cfg"))
-
-
-@contextlib.contextmanager
-def shared_parameters_allowed() -> Generator[None]:
-    """Let rsl_rl hand parameters of shared encoders to its optimizer twice; see `train_once`."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*duplicate parameters")
-        yield
-
-
-def train_once(optimizer: torch.optim.Optimizer) -> None:
-    """Make `optimizer`, before its first step, change each parameter once a step.
-
-    rsl_rl gives it the parameters of the actor and those of the critic, hence those of encoders
-    that both share twice, and each step would move them twice by the same gradient.
-    """
-    for group in optimizer.param_groups:
-        group["params"] = list(dict.fromkeys(group["params"]))
-
-
-# MERGED mjlab.rl.networks: Refusing a `symmetry_cfg` that would fail at the first update of a training run.
-
-_FUNCTION = "data_augmentation_func"
-_ALLOWED = {_FUNCTION, "use_data_augmentation", "use_mirror_loss", "mirror_loss_coeff"}
-_EXAMPLE_symmetry_check = (
-    'An example is {"data_augmentation_func": "mjlab.tasks.velocity.symmetry:mirror_left_right", '
-    '"use_data_augmentation": True}; None is without.'
-)
-
-
-def check_symmetry(env: Any, observations: Any, cfg: Mapping[str, Any]) -> None:
-    """Let the function of `symmetry_cfg` mirror the observations once.
-
-    Args:
-        env: The environments.
-        observations: Their observations, a TensorDict of batch size (N,).
-        cfg: A `RslRlOnPolicyRunnerCfg` as a dict.
-
-    Raises:
-        ValueError: a setting is missing or unknown, the function does not exist, or it does not
-            return the given rows and as many or more mirrored ones.
-    """
-    symmetry = cfg["algorithm"].get("symmetry_cfg")
-    if not symmetry:
-        return
-    if _FUNCTION not in symmetry or not set(symmetry) <= _ALLOWED:
-        raise ValueError(
-            f"symmetry_cfg has {', '.join(map(str, symmetry))}; it needs {_FUNCTION}, and may have "
-            f"{', '.join(sorted(_ALLOWED - {_FUNCTION}))}. {_EXAMPLE_symmetry_check}"
-        )
-    try:
-        function = resolve_callable(symmetry[_FUNCTION])
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"symmetry_cfg names the function {symmetry[_FUNCTION]!r}, which cannot be imported: "
-            f"{error}. {_EXAMPLE_symmetry_check}"
-        ) from error
-    actions = torch.zeros(env.num_envs, env.num_actions, device=env.device)
-    mirrored, mirrored_actions = function(env=env, obs=observations, actions=actions)
-    rows, action_rows = mirrored.batch_size[0], mirrored_actions.shape[0]
-    if rows != action_rows or rows < 2 * env.num_envs or rows % env.num_envs:
-        raise ValueError(
-            f"The function {symmetry[_FUNCTION]!r} of symmetry_cfg returned {rows} observations and "
-            f"{action_rows} actions for {env.num_envs} environments; it has to return the given ones "
-            "and as many mirror images of all of them."
-        )

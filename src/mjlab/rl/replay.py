@@ -13,6 +13,7 @@ import torch
 
 from mjlab.rl.checkpoint import load_checkpoint, save_checkpoint
 from mjlab.rl.rsl import TensorDict
+from mjlab.utils.errors import check_count
 
 logger = logging.getLogger(__name__)
 
@@ -63,8 +64,7 @@ class ReplayStorage:
         Raises:
             ValueError: there is no step to keep.
         """
-        if num_steps < 1:
-            raise ValueError(f"SAC replay_steps: expected 1 or more, got {num_steps}.")
+        check_count("SAC replay_steps", num_steps)
         self._num_envs = len(observations)
         self._num_steps = num_steps
         self._device = observations[groups[0]].device

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import math
 import os
 import statistics
 import threading
@@ -21,8 +22,10 @@ from mjlab.rl.rsl import Logger, enable_wandb
 if TYPE_CHECKING:
     from mjlab.rl.evaluation import EvaluationResult
 
+logger = logging.getLogger(__name__)
 
-# MERGED mjlab.rl.run_logger: What a training run reports while it runs, and who is told.
+# What the config may also call a service, as rsl_rl's classes.
+_LOGGER_TYPES = {"WandbLogWriter": "wandb", "NeptuneLogWriter": "neptune"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,12 +97,6 @@ class TrainingObserver:
         """Training ended: `finished`, `solved`, `interrupted` or `failed`."""
 
 
-logger = logging.getLogger(__name__)
-
-# What the config may also call a service, as rsl_rl's classes.
-_LOGGER_TYPES = {"WandbLogWriter": "wandb", "NeptuneLogWriter": "neptune"}
-
-
 class RunLogger(Logger):
     """rsl_rl's logger, silent on the console and without a GPU synchronization per step.
 
@@ -130,6 +127,7 @@ class RunLogger(Logger):
         self._finished: list[tuple[torch.Tensor, ...]] = []
         self._step_rewards: list[torch.Tensor] = []
         self._write_failed = False
+        self._has_told_losses = False
         self._thread_hook = threading.excepthook
 
     @property
@@ -166,9 +164,15 @@ class RunLogger(Logger):
             try:
                 super().init_logging_writer()
             except Exception as error:
-                if not _is_of_wandb(error):
+                # By name, because whoever does not log to it does not import wandb.
+                if not any(c.__module__.partition(".")[0] == "wandb" for c in type(error).__mro__):
                     raise
-                raise ValueError(_wandb_message(error)) from error
+                reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+                raise ValueError(
+                    f"Weights & Biases did not start a run: {reason}. Log in with `wandb login`, or set "
+                    "WANDB_API_KEY; WANDB_MODE=offline records without an account, and "
+                    "--agent.logger tensorboard does without Weights & Biases."
+                ) from error
             finally:
                 # Runners read from their config which service there is.
                 self.cfg["logger"] = wanted
@@ -263,6 +267,16 @@ class RunLogger(Logger):
         )
         self._write(stats, iteration, rnd_weight)
         return stats
+
+    def report_broken_losses(self, stats: IterationStats) -> None:
+        """Log losses that are NaN or infinite, once."""
+        broken = [name for name, value in stats.losses.items() if not math.isfinite(value)]
+        if broken and not self._has_told_losses:
+            self._has_told_losses = True
+            logger.warning(
+                "Losses that are NaN or infinite in iteration %d: %s. Rewards or observations may be too "
+                "large. It is not logged again.", stats.iteration, ", ".join(broken),
+            )  # fmt: skip
 
     def _collect_finished_episodes(self) -> None:
         if not self._finished:
@@ -426,17 +440,3 @@ def _writer_config(wanted: str | dict[str, Any], cfg: dict[str, Any]) -> str | d
             # wandb makes a difference of its own, of the repository around the working folder.
             os.environ.setdefault("WANDB_DISABLE_CODE", "true")
     return wanted
-
-
-def _is_of_wandb(error: BaseException) -> bool:
-    # By name, because whoever does not log to it does not import wandb.
-    return any(cls.__module__.partition(".")[0] == "wandb" for cls in type(error).__mro__)
-
-
-def _wandb_message(error: BaseException) -> str:
-    reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-    return (
-        f"Weights & Biases did not start a run: {reason}. Log in with `wandb login`, or set "
-        "WANDB_API_KEY; WANDB_MODE=offline records without an account, and "
-        "--agent.logger tensorboard does without Weights & Biases."
-    )

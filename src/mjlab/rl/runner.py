@@ -1,4 +1,9 @@
-"""The training run: collect, learn, save; and pick up exactly where a run left off."""
+"""On-policy runner: rollout, update, evaluation, checkpoints and exact resume.
+
+`MjlabOnPolicyRunner.learn` is the training loop. Checkpoint files are written by
+`mjlab.rl.checkpoint`, evaluations run by `mjlab.rl.evaluation`, policies exported by
+`mjlab.rl.exporter_utils`.
+"""
 
 from __future__ import annotations
 
@@ -6,45 +11,33 @@ import contextlib
 import copy
 import io
 import logging
-import math
 import os
 import time
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from mjlab.rl import checkpoint as training_state
 from mjlab.rl.checkpoint import (
-    CheckpointError,
-    RunFolderError,
-    check_finite,
+    RunRescue,
+    capture_training_state,
     check_fits,
-    check_optimizer_fits,
-    ensure_writable_folder,
+    load_algorithm,
     load_checkpoint,
     migrate,
-    not_finite,
+    restore_training_state,
     save_checkpoint,
 )
 from mjlab.rl.distributed import join_processes
 from mjlab.rl.divergence import RolloutWatch
 from mjlab.rl.evaluation import EvaluationResult, SolvedCheck, reward_unit
-from mjlab.rl.exporter_utils import (
-    DIGEST_KEY,
-    attach_metadata_to_onnx,
-    export_to_onnx,
-    get_base_metadata,
-    initializers_digest,
-)
+from mjlab.rl.exporter_utils import export_to_onnx, export_with_metadata, get_base_metadata
 from mjlab.rl.networks import (
     check_mini_batches,
-    check_networks,
-    check_symmetry,
-    settle_image_settings,
+    deduplicate_parameters,
+    prepare_train_cfg,
     shared_parameters_allowed,
-    train_once,
 )
 from mjlab.rl.replay import ReplayFiles, ReplayStorage
 from mjlab.rl.rsl import (
@@ -56,16 +49,15 @@ from mjlab.rl.rsl import (
     enable_torch_compile,
     keep_compiler_out_of_step,
 )
-from mjlab.rl.run_logger import IterationStats, RunLogger, TrainingObserver
+from mjlab.rl.run_logger import RunLogger, TrainingObserver
 from mjlab.utils.processes import process_rank
 from mjlab.utils.random import seed_rng, session_seed
 from mjlab.utils.signals import StopRequest
 from mjlab.utils.torch import torch_threads, using_torch_threads
 
 logger = logging.getLogger(__name__)
-_RECURRENT_KEYS = ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")
 
-# What `learn` ends with, in the order in which one outweighs another between processes.
+# Reasons to leave the loop, in the order in which one outweighs another between processes.
 _REASONS = ("", "solved", "interrupted")
 
 
@@ -102,16 +94,14 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             ValueError: a network cannot take the observations that `obs_groups` gives it, or
                 `symmetry_cfg` has no function that makes mirror images.
         """
-        _drop_unused_keys(train_cfg)
-        observations = env.get_observations()
-        check_networks(observations, train_cfg)
-        settle_image_settings(observations, train_cfg)
-        check_symmetry(env, observations, train_cfg)
+        prepare_train_cfg(env, train_cfg)
         if train_cfg.get("torch_compile_mode"):
             enable_torch_compile()
-        with _printing_to_log(), shared_parameters_allowed():
+        # rsl_rl prints networks and observation sets.
+        with contextlib.redirect_stdout(io.StringIO()) as printed, shared_parameters_allowed():
             super().__init__(env, train_cfg, log_dir, device)
-        train_once(self.alg.optimizer)
+        logger.debug("%s", printed.getvalue().rstrip())
+        deduplicate_parameters(self.alg.optimizer)
         if not train_cfg.get("torch_compile_mode"):
             keep_compiler_out_of_step(self.alg.optimizer)
         self.logger: RunLogger = RunLogger(
@@ -130,11 +120,6 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self.last_evaluation: EvaluationResult | None = None
         self._observations: TensorDict | None = None
         self._state_to_resume: dict[str, Any] | None = None
-        self._has_told_losses = False
-        # Descriptor of the run folder, while training.
-        self._run_folder: int | None = None
-        # What the algorithm saves after the last iteration that was finished since `learn` began.
-        self._learned: dict[str, Any] | None = None
         # An evaluation is due after the last iteration, and was left out to stop sooner.
         self._owes_evaluation = False
         self._solved_check = SolvedCheck(
@@ -146,7 +131,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self._num_collecting_threads = 1 if on_cpu else self._num_threads
         self._watch = RolloutWatch(self.env.unwrapped)
 
-    # The training loop.
+    # Training loop.
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train until `num_learning_iterations` iterations are finished IN TOTAL.
@@ -177,38 +162,108 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             )
         # Not when the runner is built, which playing does in any number of environments.
         check_mini_batches(self.env.num_envs, self.cfg)
-        first = self.current_learning_iteration
-        if self._writes and self.logger.log_dir is not None:
-            ensure_writable_folder(self.logger.log_dir)
+        first, total, reason = self.current_learning_iteration, num_learning_iterations, ""
+        num_steps, save_interval = self.cfg["num_steps_per_env"], self.cfg["save_interval"]
+        check_every_step = self.cfg.get("check_for_nan", True)
+        uses_rnd = bool(self.cfg["algorithm"].get("rnd_cfg"))
+        with self._session() as stop, RunRescue(self._run_folder) as rescue:
+            observations = self._initial_observations(init_at_random_ep_len)
+            self._notify("on_start", first, total)
+            if first < total:
+                owed, self._owes_evaluation = self._owes_evaluation, False
+                reason = self._agree_to_stop(owed and self._evaluate_solved(first))
+            while not reason and (iteration := self.current_learning_iteration) < total:
+                begin = time.perf_counter()
+                if self._run_folder is not None and iteration > first:
+                    rescue.learned = {**copy.deepcopy(self.alg.save()), **self._progress()}
+                with self._watch.explaining(self.alg.get_policy()):
+                    with torch.inference_mode():
+                        with using_torch_threads(self._num_collecting_threads):
+                            self._watch.start()
+                            for _ in range(num_steps):
+                                actions = self.alg.act(observations).to(self.env.device)
+                                observations, rewards, dones, extras = self.env.step(actions)
+                                self._watch.update()
+                                if check_every_step:
+                                    check_nan(observations, rewards, dones)
+                                observations = observations.to(self.device)
+                                rewards, dones = rewards.to(self.device), dones.to(self.device)
+                                credited, told = self._bootstrapped(observations, rewards, extras)
+                                self.alg.process_env_step(observations, credited, dones, told)
+                                intrinsic = self.alg.intrinsic_rewards if uses_rnd else None
+                                self.logger.process_env_step(rewards, dones, extras, intrinsic)
+                            self._watch.check(num_steps)
+                        collected = time.perf_counter()
+                        self.alg.compute_returns(observations)
+                    losses = self._update()
+                learned = time.perf_counter()
+                self._observations = observations
+                self.current_learning_iteration = iteration + 1
+                stats = self.logger.finish_iteration(
+                    iteration=iteration,
+                    first_iteration=first,
+                    total_iterations=total,
+                    collection_time=collected - begin,
+                    learning_time=learned - collected,
+                    losses=losses,
+                    learning_rate=self.alg.learning_rate,
+                    action_std=self.alg.get_policy().output_std.detach(),
+                    rnd_weight=rnd.weight if (rnd := getattr(self.alg, "rnd", None)) else None,
+                )
+                self._notify("on_iteration", stats)
+                self.logger.report_broken_losses(stats)
+                rescue.check_folder(self.save, f"model_{iteration}.pt")
+                is_due = self._solved_check.should_evaluate(iteration + 1, stats.mean_step_reward)
+                # Skip the evaluation, until the run is resumed, if a stop was requested.
+                interrupted = stop.requested
+                self._owes_evaluation = is_due and interrupted
+                is_solved = is_due and not interrupted and self._evaluate_solved(iteration + 1)
+                reason = self._agree_to_stop(is_solved, interrupted)
+                if not reason and iteration + 1 < total and iteration % save_interval == 0:
+                    self._save_checkpoint()
+            rescue.learned = None
+            # A run that is solved as it is resumed leaves a checkpoint as others do.
+            if self.current_learning_iteration > first or reason == "solved":
+                self._save_checkpoint()
+            elif total <= first:
+                logger.warning(
+                    "Nothing to train: the checkpoint has finished %d iterations, and "
+                    "max_iterations, which counts them in, is %d.", first, total,
+                )  # fmt: skip
+            self.stop_reason = reason or "finished"
+
+    @contextlib.contextmanager
+    def _session(self) -> Generator[StopRequest]:
+        """Be ready to train within the block: files open, signals caught, threads set."""
         self.logger.init_logging_writer()
-        self.stop_reason, self._learned = "failed", None
+        self.stop_reason = "failed"
         try:
             with (
                 using_torch_threads(self._num_threads),
-                StopRequest(lambda name: self._tell("on_stop_requested", name)) as stop,
-                self._holding_run_folder(),
+                StopRequest(lambda name: self._notify("on_stop_requested", name)) as stop,
             ):
-                observations = self._start(init_at_random_ep_len)
-                self._tell("on_start", first, num_learning_iterations)
-                with self._saving_after_errors():
-                    reason = self._iterate(observations, num_learning_iterations, stop)
-                self._finish(first, num_learning_iterations, reason)
-                self.stop_reason = reason or "finished"
+                yield stop
         finally:
             self.logger.stop_logging_writer()
             self._solved_check.close()
             if (close := getattr(self.alg, "close", None)) is not None:
                 close()
-            self._tell("on_end", self.stop_reason)
+            self._notify("on_end", self.stop_reason)
 
-    def _start(self, init_at_random_ep_len: bool) -> TensorDict:
+    def _initial_observations(self, init_at_random_ep_len: bool) -> TensorDict:
         """Return the observations to start from: resumed ones, or those of the environments."""
         self.alg.train_mode()
         # Here and not in the wrapper, which playing and evaluating use as well.
-        if self._uses_final_observations and hasattr(self.env, "observe_ends"):
+        takes_final = isinstance(self.alg, PPO) or getattr(
+            self.alg, "takes_final_observations", False
+        )
+        if takes_final and hasattr(self.env, "observe_ends"):
             self.env.observe_ends()
         if self.is_distributed:
             self.alg.broadcast_parameters()
+        if self._observations is not None:
+            # `learn` was called before in this process: the environments are where they were.
+            return self._observations
         observations = self._resumed_observations()
         if observations is None:
             if init_at_random_ep_len:
@@ -220,57 +275,32 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self._observations = observations
         return observations
 
-    def _iterate(self, observations: TensorDict, total: int, stop: StopRequest) -> str:
-        """Train until `total` iterations are finished; return why it ended before, or ""."""
-        first = self.current_learning_iteration
-        if first < total:
-            is_solved = self._owes_evaluation and self._writes and self._evaluate_solved(first)
-            self._owes_evaluation = False
-            if reason := self._agree_to_stop(int(is_solved)):
-                return reason
-        for iteration in range(first, total):
-            begin = time.perf_counter()
-            if self._writes and self.logger.log_dir is not None and iteration > first:
-                self._learned = {**copy.deepcopy(self.alg.save()), **self._progress()}
-            with self._watch.explaining(self.alg.get_policy()):
-                with torch.inference_mode():
-                    with using_torch_threads(self._num_collecting_threads):
-                        observations = self._collect(observations)
-                        self._watch.check(self.cfg["num_steps_per_env"])
-                    collected = time.perf_counter()
-                    self.alg.compute_returns(observations)
-                losses = self._update()
-            learned = time.perf_counter()
-            self._observations = observations
-            self.current_learning_iteration = iteration + 1
-            stats = self._report(
-                iteration, first, total, collected - begin, learned - collected, losses
+    def _resumed_observations(self) -> TensorDict | None:
+        """Restore episodes and generators of the checkpoint that was loaded, if there are any."""
+        state, self._state_to_resume = self._state_to_resume, None
+        if state is None:
+            if self.current_learning_iteration > 0:
+                logger.warning("Episodes and random numbers start anew: the checkpoint has none.")
+            return None
+        if self.is_distributed:
+            # A checkpoint has the episodes of the first process only.
+            logger.warning(
+                "Episodes and random numbers start anew, because several processes share the run."
             )
-            self._check_run_folder()
-            reason = self._reason_to_stop(stop, stats)
-            if reason:
-                return reason
-            if iteration + 1 < total and iteration % self.cfg["save_interval"] == 0:
-                self._save_checkpoint()
-        return ""
-
-    def _collect(self, observations: TensorDict) -> TensorDict:
-        """Step all environments `num_steps_per_env` times; return the last observations."""
-        check_every_step = self.cfg.get("check_for_nan", True)
-        self._watch.start()
-        for _ in range(self.cfg["num_steps_per_env"]):
-            actions = self.alg.act(observations)
-            observations, rewards, dones, extras = self.env.step(actions.to(self.env.device))
-            self._watch.update()
-            if check_every_step:
-                check_nan(observations, rewards, dones)
-            observations = observations.to(self.device)
-            rewards, dones = rewards.to(self.device), dones.to(self.device)
-            credited, told = self._bootstrapped(observations, rewards, extras)
-            self.alg.process_env_step(observations, credited, dones, told)
-            intrinsic = self.alg.intrinsic_rewards if self._uses_rnd else None
-            self.logger.process_env_step(rewards, dones, extras, intrinsic)
-        return observations
+            self.logger.load_totals(state["logger"])
+            # Otherwise, every session would draw the numbers of the first one again.
+            seed_rng(session_seed(int(self.cfg.get("seed", 0)), self.current_learning_iteration))
+            return None
+        try:
+            return restore_training_state(
+                state, self.env, self.alg, self.logger.load_state_dict, self.device
+            )
+        except ValueError as error:
+            logger.warning(
+                "Weights, optimizer and iteration are resumed, but episodes and random numbers "
+                "start anew, because the saved state does not fit. %s", error,
+            )  # fmt: skip
+            return None
 
     def _bootstrapped(
         self, observations: TensorDict, rewards: torch.Tensor, extras: dict[str, Any]
@@ -323,49 +353,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         algorithm.last_hidden_states = (algorithm.last_hidden_states[0], None)
         return losses
 
-    def _report(
-        self,
-        iteration: int,
-        first: int,
-        total: int,
-        collection_time: float,
-        learning_time: float,
-        losses: dict[str, float],
-    ) -> IterationStats:
-        stats = self.logger.finish_iteration(
-            iteration=iteration,
-            first_iteration=first,
-            total_iterations=total,
-            collection_time=collection_time,
-            learning_time=learning_time,
-            losses=losses,
-            learning_rate=self.alg.learning_rate,
-            action_std=self.alg.get_policy().output_std.detach(),
-            rnd_weight=rnd.weight if (rnd := getattr(self.alg, "rnd", None)) else None,
-        )
-        self._tell("on_iteration", stats)
-        broken = [name for name, value in losses.items() if not math.isfinite(value)]
-        if broken and not self._has_told_losses:
-            self._has_told_losses = True
-            logger.warning(
-                "Losses that are NaN or infinite in iteration %d: %s. Rewards or observations may be too "
-                "large. It is not logged again.", iteration + 1, ", ".join(broken),
-            )  # fmt: skip
-        return stats
-
-    def _reason_to_stop(self, stop: StopRequest, stats: IterationStats) -> str:
-        """Return "solved" or "interrupted" if training should end here, else ""."""
-        is_due = self._solved_check.is_due(stats)
-        # Whoever asks to stop does not want to wait for an evaluation first.
-        self._owes_evaluation = is_due and stop.requested
-        if stop.requested:
-            return self._agree_to_stop(2)
-        return self._agree_to_stop(
-            int(is_due and self._writes and self._evaluate_solved(stats.iteration))
-        )
-
-    def _agree_to_stop(self, code: int) -> str:
-        """Return of `_REASONS` the one at `code`, or the one that outweighs it in another process."""
+    def _agree_to_stop(self, is_solved: bool, interrupted: bool = False) -> str:
+        """Return the weightiest reason to stop of all processes, or ""."""
+        code = 2 if interrupted else int(is_solved)
         if self.is_distributed:
             # All processes have to leave the loop at the same iteration.
             shared = torch.tensor(code, device=self.device)
@@ -373,54 +363,33 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             code = int(shared.item())
         return _REASONS[code]
 
-    def _finish(self, first: int, total: int, reason: str) -> None:
-        # A run that is solved as it is resumed leaves a checkpoint as others do.
-        if self.current_learning_iteration == first and reason != "solved":
-            if total <= first:
-                logger.warning(
-                    "Nothing to train: the checkpoint has finished %d iterations, and "
-                    "max_iterations, which counts them in, is %d.", first, total,
-                )  # fmt: skip
-            return
-        self._save_checkpoint()
-
-    def _resolve_threads(self) -> int:
-        if torch.device(self.device).type != "cpu":
-            return torch.get_num_threads()
-        # An algorithm that learns beside the physics says how many it leaves.
-        if (own := getattr(self.alg, "num_threads", None)) is not None:
-            return own
-        parameters = sum(
-            parameter.numel()
-            for group in self.alg.optimizer.param_groups
-            for parameter in group["params"]
-        )
-        rows = self.env.num_envs * self.cfg["num_steps_per_env"]
-        parts = self.cfg["algorithm"].get("num_mini_batches", 1)
-        return torch_threads(parameters, rows // max(int(parts), 1))
-
-    # Evaluation while training.
-
-    def _evaluate_solved(self, iteration: int) -> bool:
-        """Evaluate the policy after `iteration` iterations; return whether to stop for it."""
-        check = self._solved_check
-        check.last_iteration = iteration
-        result = self.evaluate()
-        is_good = check.is_solved_by(result)
-        self._tell("on_evaluation", iteration, result, is_good)
-        self.logger.write_evaluation(result, iteration - 1)
-        if not (is_good and check.stops_training):
-            return False
-        self.last_evaluation = result = check.confirm(iteration)
-        solved = check.is_solved_by(result)
-        self._tell("on_confirmation", iteration, result, solved)
-        self.logger.write_evaluation(result, iteration - 1, "Confirmation")
-        return solved
+    # Evaluation.
 
     def evaluate(self) -> EvaluationResult:
         """Score the policy in environments of its own; the run itself is not touched."""
         self.last_evaluation = self._solved_check.evaluate()
         return self.last_evaluation
+
+    def _evaluate_solved(self, iteration: int) -> bool:
+        """Evaluate the policy after `iteration` iterations; return whether to stop for it.
+
+        Only in the first process: False in others.
+        """
+        if not self._writes:
+            return False
+        check = self._solved_check
+        check.last_iteration = iteration
+        result = self.evaluate()
+        is_good = check.is_solved_by(result)
+        self._notify("on_evaluation", iteration, result, is_good)
+        self.logger.write_evaluation(result, iteration - 1)
+        if not (is_good and check.stops_training):
+            return False
+        self.last_evaluation = result = check.confirm(iteration)
+        solved = check.is_solved_by(result)
+        self._notify("on_confirmation", iteration, result, solved)
+        self.logger.write_evaluation(result, iteration - 1, "Confirmation")
+        return solved
 
     # Checkpoints.
 
@@ -440,8 +409,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if observations is None:
             observations = self.env.get_observations()
         checkpoint = {**self.alg.save(), **self._progress(infos)}
-        checkpoint["training_state"] = training_state.capture(
-            self.env, self.alg, self.logger, observations
+        checkpoint["training_state"] = capture_training_state(
+            self.env, self.alg, self.logger.state_dict(), observations
         )
         replay = self._replay if self.cfg["algorithm"].get("save_replay") else None
         if replay is not None:
@@ -452,19 +421,6 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             ReplayFiles(path).remove_others()
         if self.cfg.get("upload_model", True):
             self.logger.save_model(path, max(self.current_learning_iteration - 1, 0))
-
-    def _progress(self, infos: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Return the entries of a checkpoint that say how far the run has got."""
-        done = self.current_learning_iteration
-        counter = getattr(self.env.unwrapped, "common_step_counter", 0)
-        return {
-            # rsl_rl calls the last finished iteration "iter"; it cannot tell none from one.
-            "iter": max(done - 1, 0),
-            "iterations_finished": done,
-            "infos": {**(infos or {}), "env_state": {"common_step_counter": int(counter)}},
-            "last_evaluated": self._solved_check.last_iteration,
-            "owes_evaluation": self._owes_evaluation,
-        }
 
     def load(
         self,
@@ -492,9 +448,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 network; nothing was changed then.
         """
         checkpoint = migrate(load_checkpoint(path), str(path))
-        self._check_parts(checkpoint, load_cfg, strict, str(path))
-        with_iteration = self._load_algorithm(checkpoint, load_cfg, strict, str(path))
-        if with_iteration:
+        if load_algorithm(self.alg, checkpoint, load_cfg, strict, str(path)):
             finished = checkpoint.get("iterations_finished", checkpoint.get("iter", -1) + 1)
             self.current_learning_iteration = finished
             self._solved_check.last_iteration = checkpoint.get("last_evaluated", 0)
@@ -521,135 +475,28 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         check_fits(algorithm._raw_teacher, policy, name="teacher", path=str(path))
         algorithm.load({"actor_state_dict": policy}, {"teacher": True}, strict=True)
 
-    def _check_parts(
-        self, checkpoint: Mapping[str, Any], load_cfg: dict | None, strict: bool, path: str
-    ) -> None:
-        for name in ("actor", "critic", "student", "teacher"):
-            model = getattr(self.alg, f"_raw_{name}", None)
-            if strict and model is not None and (load_cfg is None or load_cfg.get(name)):
-                check_fits(model, checkpoint.get(f"{name}_state_dict"), name=name, path=path)
-        if load_cfg is None or load_cfg.get("optimizer"):
-            saved = checkpoint.get("optimizer_state_dict")
-            check_optimizer_fits(self.alg.optimizer, saved, path=path)
-            check_finite(checkpoint, path)
-
-    def _load_algorithm(
-        self, checkpoint: dict[str, Any], load_cfg: dict | None, strict: bool, path: str
-    ) -> bool:
-        """Let rsl_rl load its parts; return whether the count of iterations is to be loaded."""
-        # rsl_rl loads one part after the other, and what fits only in part is half loaded then.
-        before = copy.deepcopy(self.alg.save())
-        try:
-            return self.alg.load(checkpoint, load_cfg, strict)
-        except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
-            self.alg.load(before, None, True)
-            raise CheckpointError(
-                f"The checkpoint {path!r} does not fit this algorithm: {error}. To use its "
-                "policy only, load it with load_cfg={'actor': True}."
-            ) from error
-
-    def _resumed_observations(self) -> TensorDict | None:
-        state, self._state_to_resume = self._state_to_resume, None
-        if self._observations is not None:
-            # `learn` was called before in this process: the environments are where they were.
-            return self._observations
-        if self.current_learning_iteration == 0 and state is None:
-            return None
-        if state is None:
-            logger.warning("Episodes and random numbers start anew: the checkpoint has none.")
-            return None
-        if self.is_distributed:
-            self._resume_among_others(state)
-            return None
-        try:
-            return training_state.restore(state, self.env, self.alg, self.logger)
-        except ValueError as error:
-            logger.warning(
-                "Weights, optimizer and iteration are resumed, but episodes and random numbers "
-                "start anew, because the saved state does not fit. %s", error,
-            )  # fmt: skip
-            return None
-
-    def _resume_among_others(self, state: dict[str, Any]) -> None:
-        """Restore what all processes share. A checkpoint has the episodes of the first only."""
-        logger.warning(
-            "Episodes and random numbers start anew, because several processes share the run."
-        )
-        self.logger.load_totals(state["logger"])
-        # Otherwise, every session would draw the numbers of the first one again.
-        seed_rng(session_seed(int(self.cfg.get("seed", 0)), self.current_learning_iteration))
-
     def _save_checkpoint(self) -> None:
         """Write a checkpoint into the run folder, and the policy as ONNX beside it."""
-        if not self._writes or self.logger.log_dir is None:
+        if self._run_folder is None:
             return
-        path = self._checkpoint_path(self.logger.log_dir)
+        path = os.path.join(self._run_folder, f"model_{self.current_learning_iteration - 1}.pt")
         self.save(path)
         if not self.exports_on_save:
             self.export_policy(str(self._get_export_paths(path)[2]))
-        self._tell("on_checkpoint", path)
+        self._notify("on_checkpoint", path)
 
-    def _checkpoint_path(self, folder: str) -> str:
-        return os.path.join(folder, f"model_{self.current_learning_iteration - 1}.pt")
-
-    @contextlib.contextmanager
-    def _holding_run_folder(self) -> Generator[None]:
-        """Keep the run folder open, so that another one of its name can be told from it."""
-        if self._writes and self.logger.log_dir is not None:
-            # Windows opens no folders, and deletes none in which a file is open.
-            with contextlib.suppress(PermissionError):
-                self._run_folder = os.open(self.logger.log_dir, os.O_RDONLY)
-        try:
-            yield
-        finally:
-            if self._run_folder is not None:
-                os.close(self._run_folder)
-                self._run_folder = None
-
-    def _check_run_folder(self) -> None:
-        """Save the run beside its folder, and raise RunFolderError, if that is gone."""
-        folder = self.logger.log_dir
-        if self._run_folder is None or folder is None:
-            return
-        # The next writer, such as TensorBoard, creates another folder of that name.
-        with contextlib.suppress(OSError):
-            if os.path.samestat(os.fstat(self._run_folder), os.stat(folder)):
-                return
-        path = self._checkpoint_path(f"{os.path.normpath(folder)}_rescued")
-        self.save(path)
-        raise RunFolderError(
-            f"The run folder {folder!r} is no longer there: it was deleted or moved while the run was "
-            f"training. The run was saved to {path!r}, from which it resumes."
-        )
-
-    @contextlib.contextmanager
-    def _saving_after_errors(self) -> Generator[None]:
-        """After an error in the block, save what the last finished iteration had learned."""
-        try:
-            yield
-        except (CheckpointError, RunFolderError):
-            raise
-        except Exception:
-            folder = self.logger.log_dir
-            learned = self._learned
-            if learned is not None and folder is not None:
-                path = os.path.join(folder, f"model_{learned['iter']}.pt")
-                # Weights that are NaN may be why training failed, and could not be loaded again.
-                if not os.path.exists(path) and not not_finite(learned):
-                    self._save_learned(learned, path)
-            raise
-
-    def _save_learned(self, learned: dict[str, Any], path: str) -> None:
-        try:
-            save_checkpoint(learned, path)
-        except CheckpointError as error:
-            # What failed first is what the user has to know.
-            logger.warning("%s", error)
-            return
-        logger.warning(
-            "Training failed in iteration %d. Weights and optimizer of before are in %s; a run that is "
-            "resumed from there starts in new episodes.", learned["iterations_finished"] + 1, path,
-        )  # fmt: skip
+    def _progress(self, infos: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Return the entries of a checkpoint that say how far the run has got."""
+        done = self.current_learning_iteration
+        counter = getattr(self.env.unwrapped, "common_step_counter", 0)
+        return {
+            # rsl_rl calls the last finished iteration "iter"; it cannot tell none from one.
+            "iter": max(done - 1, 0),
+            "iterations_finished": done,
+            "infos": {**(infos or {}), "env_state": {"common_step_counter": int(counter)}},
+            "last_evaluated": self._solved_check.last_iteration,
+            "owes_evaluation": self._owes_evaluation,
+        }
 
     # Export.
 
@@ -675,22 +522,12 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             a run is not lost because its policy has no ONNX form.
         """
         if path is None:
-            if not self._writes or self.logger.log_dir is None:
+            if self._run_folder is None:
                 return None
-            checkpoint = os.path.join(self.logger.log_dir, "model.pt")
+            checkpoint = os.path.join(self._run_folder, "model.pt")
             path = str(self._get_export_paths(checkpoint)[2])
-        target = Path(path)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            self.export_policy_to_onnx(str(target.parent), target.name)
-        except Exception as error:
-            logger.warning("The policy was not exported to %s: %s", path, error)
+        if not export_with_metadata(self.export_policy_to_onnx, self.onnx_metadata, path):
             return None
-        try:
-            digest = {DIGEST_KEY: initializers_digest(path)}
-            attach_metadata_to_onnx(path, {**self.onnx_metadata(), **digest})
-        except Exception as error:
-            logger.warning("The exported policy %s is without metadata: %s", path, error)
         if self.cfg.get("upload_model", True):
             self.logger.save_model(path, max(self.current_learning_iteration - 1, 0))
         return path
@@ -714,7 +551,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         metadata = dict(get_base_metadata(self.env.unwrapped, run, list(policy.obs_groups)))
         return {**metadata, "image_groups": images} if images else metadata
 
-    # Helpers.
+    # Processes, threads, observers.
 
     def _configure_multi_gpu(self) -> None:
         """Join the other processes of the run, if there are any. In place of rsl_rl's, which knows
@@ -739,47 +576,33 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         return self.gpu_global_rank == 0
 
     @property
+    def _run_folder(self) -> str | None:
+        """Run folder; None in processes that write nothing."""
+        return self.logger.log_dir if self._writes else None
+
+    @property
     def _replay(self) -> ReplayStorage | None:
         storage: Any = getattr(self.alg, "storage", None)
         return storage if isinstance(storage, ReplayStorage) else None
 
-    @property
-    def _uses_final_observations(self) -> bool:
-        """True if final observations are bootstrapped from: here for PPO, or by the algorithm."""
-        return isinstance(self.alg, PPO) or getattr(self.alg, "takes_final_observations", False)
+    def _resolve_threads(self) -> int:
+        if torch.device(self.device).type != "cpu":
+            return torch.get_num_threads()
+        # An algorithm that learns beside the physics says how many it leaves.
+        if (own := getattr(self.alg, "num_threads", None)) is not None:
+            return own
+        parameters = sum(
+            parameter.numel()
+            for group in self.alg.optimizer.param_groups
+            for parameter in group["params"]
+        )
+        rows = self.env.num_envs * self.cfg["num_steps_per_env"]
+        parts = self.cfg["algorithm"].get("num_mini_batches", 1)
+        return torch_threads(parameters, rows // max(int(parts), 1))
 
-    @property
-    def _uses_rnd(self) -> bool:
-        return bool(self.cfg["algorithm"].get("rnd_cfg"))
-
-    def _tell(self, event: str, *args: Any) -> None:
+    def _notify(self, event: str, *args: Any) -> None:
         for observer in self.observers:
             getattr(observer, event)(*args)
-
-
-def _drop_unused_keys(train_cfg: dict) -> None:
-    """Remove settings of models that rsl_rl's constructors take only where they are used."""
-    for name in ("actor", "critic", "student", "teacher"):
-        model = train_cfg.get(name)
-        if not isinstance(model, dict):
-            continue
-        for key in ("cnn_cfg", "distribution_cfg"):
-            if model.get(key, ...) is None:
-                del model[key]
-        if model.get("rnn_type", ...) is None:
-            for key in _RECURRENT_KEYS:
-                model.pop(key, None)
-
-
-@contextlib.contextmanager
-def _printing_to_log() -> Generator[None]:
-    """Send what rsl_rl prints (networks, observation sets) to the log, at level DEBUG."""
-    with contextlib.redirect_stdout(io.StringIO()) as printed:
-        yield
-    logger.debug("%s", printed.getvalue().rstrip())
-
-
-# MERGED mjlab.rl.runner: The runner of tasks whose policies are deployed.
 
 
 class ExportingOnPolicyRunner(MjlabOnPolicyRunner):

@@ -189,7 +189,13 @@ class SAC:
                 model.update_normalization(obs)
             if self._reward_scale is not None:
                 self._reward_scale.update(rewards, dones, together=self._multi_gpu is not None)
-            self._follow_actor()
+            # The policy takes over what was learned: parameters in part, observation statistics at once.
+            for own, learned in zip(
+                self._policy.parameters(), self.actor.parameters(), strict=True
+            ):
+                own.lerp_(learned, self._policy_average)
+            for own, learned in zip(self._policy.buffers(), self.actor.buffers(), strict=True):
+                own.copy_(learned)
         self._num_steps += 1
         if self._num_steps < self._learning_starts:
             return
@@ -200,13 +206,6 @@ class SAC:
             return
         with torch.inference_mode(False), torch.enable_grad():
             self._learn()
-
-    def _follow_actor(self) -> None:
-        """Let the policy take over what was learned: parameters in part, observation statistics at once."""
-        for own, learned in zip(self._policy.parameters(), self.actor.parameters(), strict=True):
-            own.lerp_(learned, self._policy_average)
-        for own, learned in zip(self._policy.buffers(), self.actor.buffers(), strict=True):
-            own.copy_(learned)
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Do nothing: there are no returns of whole episodes."""
@@ -280,7 +279,8 @@ class SAC:
         if self._num_updates_made % self._policy_delay == 0:
             figures |= self._actor_gradients(inputs)
         if self._multi_gpu is not None:
-            self._reduce_gradients()
+            parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+            reduce_gradients_in_buckets(parameters, self._multi_gpu["world_size"], self._bucket_mb)
         self.optimizer.step()
         with torch.no_grad():
             self._log_alpha.clamp_(*self._log_alpha_range)
@@ -399,7 +399,6 @@ class SAC:
         Returns whether the count of iterations is to be loaded.
         """
         self._wait()
-        everything = load_cfg is None
         cfg = dict.fromkeys(_PARTS, True) if load_cfg is None else load_cfg
         if cfg.get("actor"):
             for model in (self.actor, self._policy):
@@ -410,31 +409,24 @@ class SAC:
         if cfg.get("optimizer"):
             self.optimizer.load_state_dict(loaded_dict["optimizer_state_dict"])
             self.learning_rate = self.optimizer.param_groups[1]["lr"]
-        if everything:
-            self._load_state(loaded_dict["sac_state_dict"])
+        if load_cfg is None:
+            state = loaded_dict["sac_state_dict"]
+            self.actor.load_state_dict(state["actor"])
+            self._target.load_state_dict(state["target"])
+            with torch.no_grad():
+                self._log_alpha.copy_(state["log_alpha"])
+            self._generator.set_state(state["generator"].cpu())
+            self._num_steps, self._num_updates_made = state["num_steps"], state["num_updates"]
+            self._noise.load_state_dict(state["noise"])
+            if self._reward_scale is not None:
+                self._reward_scale.load_state_dict(state["reward_scale"])
         return cfg.get("iteration", False)
-
-    def _load_state(self, state: dict[str, Any]) -> None:
-        self.actor.load_state_dict(state["actor"])
-        self._target.load_state_dict(state["target"])
-        with torch.no_grad():
-            self._log_alpha.copy_(state["log_alpha"])
-        self._generator.set_state(state["generator"].cpu())
-        self._num_steps, self._num_updates_made = state["num_steps"], state["num_updates"]
-        self._noise.load_state_dict(state["noise"])
-        if self._reward_scale is not None:
-            self._reward_scale.load_state_dict(state["reward_scale"])
 
     def broadcast_parameters(self) -> None:
         """Give all processes the weights of the first."""
         for model in (self.actor, self.critic, self._policy, self._target):
             for tensor in model.state_dict().values():
                 torch.distributed.broadcast(tensor, src=0)
-
-    def _reduce_gradients(self) -> None:
-        assert self._multi_gpu is not None
-        parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
-        reduce_gradients_in_buckets(parameters, self._multi_gpu["world_size"], self._bucket_mb)
 
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict, device: str) -> SAC:

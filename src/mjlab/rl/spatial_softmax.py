@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -9,8 +10,8 @@ from torch import nn
 
 from mjlab.rl.rsl import CNN, CNNModel, TensorDict
 
-# Keys of a CNN config that are not for rsl_rl's CNN.
-_OWN_KEYS = ("spatial_softmax", "spatial_softmax_temperature")
+SPATIAL_SOFTMAX_KEYS = ("spatial_softmax", "spatial_softmax_temperature")
+"""Keys of a CNN config that are not for rsl_rl's CNN."""
 
 
 class SpatialSoftmax(nn.Module):
@@ -101,7 +102,16 @@ class SpatialSoftmaxCNNModel(CNNModel):
         """
         if cnns is None:
             self._get_obs_dim(obs, obs_groups, obs_set)
-            encoders = self._make_encoders(cnn_cfg)
+            settings = cnn_cfg_by_group(cnn_cfg, self.obs_groups_2d)
+            encoders: Any = {
+                group: SpatialSoftmaxCNN(
+                    input_dim=self.obs_dims_2d[index],
+                    input_channels=self.obs_channels_2d[index],
+                    temperature=settings[group].get("spatial_softmax_temperature", 1.0),
+                    **{k: v for k, v in settings[group].items() if k not in SPATIAL_SOFTMAX_KEYS},
+                )
+                for index, group in enumerate(self.obs_groups_2d)
+            }
         else:
             encoders = cnns
         super().__init__(
@@ -116,21 +126,20 @@ class SpatialSoftmaxCNNModel(CNNModel):
             cnns=encoders,
         )
 
-    def _make_encoders(self, cnn_cfg: dict[str, Any]) -> dict[str, nn.Module]:
-        groups = list(self.obs_groups_2d)
-        if not all(isinstance(value, dict) for value in cnn_cfg.values()):
-            cnn_cfg = dict.fromkeys(groups, cnn_cfg)
-        if set(cnn_cfg) != set(groups):
-            raise ValueError(
-                f"cnn_cfg has configs for {sorted(cnn_cfg)}, and the image groups are "
-                f"{sorted(groups)}; give one for each, or one for all."
-            )
-        return {
-            group: SpatialSoftmaxCNN(
-                input_dim=self.obs_dims_2d[index],
-                input_channels=self.obs_channels_2d[index],
-                temperature=cnn_cfg[group].get("spatial_softmax_temperature", 1.0),
-                **{k: v for k, v in cnn_cfg[group].items() if k not in _OWN_KEYS},
-            )
-            for index, group in enumerate(groups)
-        }
+
+def cnn_cfg_by_group(
+    cnn_cfg: Mapping[str, Any], groups: Sequence[str], name: str = "cnn_cfg"
+) -> dict[str, dict[str, Any]]:
+    """Return the CNN config of each image group; one config is that of all groups.
+
+    Raises:
+        ValueError: `cnn_cfg`, called `name`, has configs for other groups.
+    """
+    if not all(isinstance(value, dict) for value in cnn_cfg.values()):
+        return {group: dict(cnn_cfg) for group in groups}
+    if set(cnn_cfg) != set(groups):
+        raise ValueError(
+            f"{name} has configs for {sorted(cnn_cfg)}, and the image groups are {sorted(groups)}; "
+            "give one for each, or one for all."
+        )
+    return {group: dict(cnn_cfg[group]) for group in groups}

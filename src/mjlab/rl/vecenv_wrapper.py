@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.rl.rsl import TensorDict, VecEnv
+from mjlab.utils.errors import check_positive
+from mjlab.utils.spaces import batch_space
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -34,15 +36,19 @@ class RslRlVecEnvWrapper(VecEnv):
         Raises:
             ValueError: `clip_actions` is not positive.
         """
-        if clip_actions is not None and not clip_actions > 0:
-            raise ValueError(f"clip_actions is {clip_actions}; give a positive number or None.")
+        if clip_actions is not None:
+            check_positive("clip_actions", clip_actions)
         self.env = env
         self.clip_actions = clip_actions
         self.num_envs = self.unwrapped.num_envs
         self.device = torch.device(self.unwrapped.device)
         self.max_episode_length = self.unwrapped.max_episode_length
         self.num_actions = self.unwrapped.action_manager.total_action_dim
-        self._limit_action_spaces()
+        if clip_actions is not None:
+            unwrapped, limits = self.unwrapped, {"low": -clip_actions, "high": clip_actions}
+            space = dataclasses.replace(unwrapped.single_action_space, **limits)
+            unwrapped.single_action_space = space
+            unwrapped.action_space = batch_space(space, self.num_envs)
         self.env.reset()
 
     def __str__(self) -> str:
@@ -147,13 +153,3 @@ class RslRlVecEnvWrapper(VecEnv):
 
     def _as_tensordict(self, observations: dict[str, Any]) -> TensorDict:
         return TensorDict(observations, batch_size=[self.num_envs])
-
-    def _limit_action_spaces(self) -> None:
-        if self.clip_actions is None:
-            return
-        from mjlab.utils.spaces import batch_space
-
-        limits = {"low": -self.clip_actions, "high": self.clip_actions}
-        env = self.unwrapped
-        env.single_action_space = dataclasses.replace(env.single_action_space, **limits)
-        env.action_space = batch_space(env.single_action_space, self.num_envs)

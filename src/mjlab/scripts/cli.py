@@ -1,38 +1,30 @@
-"""What the command lines share: finding the task, parsing flags, and one clear message per error.
+"""The command `mjlab`: table of subcommands, dispatch, and errors as one message each.
 
-Nothing heavy is imported here, so that `--help` and a mistyped task name answer at once.
+`train`, `play` and some others are also commands of their own. Nothing beyond the standard library
+is imported before a command runs, so that `--help` and a mistyped task name answer at once.
 """
 
 from __future__ import annotations
 
-import linecache
+import importlib
 import logging
 import os
 import sys
 import traceback
 import warnings
 from collections.abc import Callable
-from dataclasses import fields
-from typing import Any, NoReturn, TypeVar
+from dataclasses import dataclass
+from typing import NoReturn
 
-C = TypeVar("C")
+from mjlab.utils.errors import BadCallError, MjlabError, UserError
+from mjlab.utils.logging import shorten
 
 TRACEBACK_VARIABLE = "MJLAB_TRACEBACK"
 
 # Exit status of a process that gave up because another of its run failed.
 OTHER_PROCESS_STATUS = 3
 
-# Errors that a user can mend, of modules that are imported only where they are needed.
-_OTHER_PROCESS = ("mjlab.rl.distributed", "OtherProcessError")
-_LAZY_ERRORS = (
-    ("mjlab.sim.engine", "EngineUnavailableError"),
-    ("mjlab.rl.checkpoint", "CheckpointError"),
-    ("mjlab.viewer.offscreen_renderer", "RenderingUnavailableError"),
-    _OTHER_PROCESS,
-)
-
-
-# How Python, the loader of libraries, MuJoCo and torch, on a CPU and a GPU, say that memory is short.
+# Messages of Python, the dynamic loader, MuJoCo and torch (CPU, GPU) about too little memory.
 _OUT_OF_MEMORY = (
     "can't start new thread",
     "failed to map segment",
@@ -40,31 +32,365 @@ _OUT_OF_MEMORY = (
     "Could not allocate memory",
     "out of memory. Tried to allocate",
 )
-_LONGEST_MESSAGE = 8000
 
 
-class UserError(Exception):
-    """A mistake in what was asked for, told in one message."""
+@dataclass(frozen=True)
+class Command:
+    """Subcommand of `mjlab`."""
 
-    exit_status = 1
-    """Exit status of the command."""
+    name: str
+    """Name on the command line."""
+    group: str
+    """Heading in `mjlab --help`."""
+    summary: str
+    """One line in `mjlab --help`."""
+    function: str
+    """Implementation as "module:function", called as `function(argv, prog)`."""
+    argument: str | None = None
+    """First argument, which is required: TASK, a registered task, or another word."""
+    details: str = ""
+    """Text of `--help`. Without it and without `argument`, the function answers `--help`."""
+    examples: tuple[str, ...] = ()
+    """Command lines, without `uv run`."""
+    unknown_task_status: int = 1
+    """Exit status for a task that is not registered."""
+
+    def usage(self, prog: str) -> str:
+        """Return the help printed by `prog --help`."""
+        words = (prog, self.argument, "[flags]")
+        lines = [f"usage: {' '.join(filter(None, words))}", "", self.details or self.summary, ""]
+        if self.examples:
+            lines += ["examples:", *(f"    uv run {example}" for example in self.examples), ""]
+        if self.argument == "TASK":
+            lines += [
+                f"`{prog} TASK --help` lists every flag of the task; `mjlab list-envs` lists the "
+                "tasks."
+            ]
+        return "\n".join(lines).rstrip()
 
 
-class BadCallError(UserError):
-    """A mistake in the command line itself, found before anything is built."""
+COMMANDS = (
+    Command(
+        "train",
+        "Learning",
+        "Train a policy.",
+        "mjlab.scripts.train:command",
+        "TASK",
+        "Train a policy, by PPO or, with --learner sac, by SAC. Checkpoints, curves and the exported "
+        "policy go to\nlogs/rsl_rl/<experiment>/<time>/.",
+        (
+            "train Mjlab-Cartpole-Swingup --num-envs 4096",
+            "train Mjlab-Cartpole-Swingup --agent.algorithm.learning-rate 3e-4 --agent.seed 1",
+            "train Mjlab-Cartpole-Swingup --agent.resume True",
+            "train Mjlab-Velocity-Flat-Unitree-Go1 --profile cpu",
+            "train Mjlab-Velocity-Flat-Unitree-Go1 --learner sac --agent.algorithm.batch-size 1024",
+        ),
+    ),
+    Command(
+        "train-seeds",
+        "Learning",
+        "Train a task with several seeds, one after the other.",
+        "mjlab.scripts.train_seeds:command",
+        "TASK",
+        "Train a task once for each seed 1, 2, ..., N (5 unless --seeds says otherwise), each run to "
+        "its last\niteration. All other flags are those of `train`.",
+        (
+            "train-seeds Mjlab-Cartpole-Swingup --num-envs 512 --agent.max-iterations 100",
+            "plot-seeds logs/rsl_rl/cartpole/*_seed_? --output swingup.png",
+        ),
+    ),
+    Command(
+        "plot-seeds",
+        "Learning",
+        "Plot the mean learning curve of several runs.",
+        "mjlab.scripts.train_seeds:plot_command",
+    ),
+    Command(
+        "verify",
+        "Learning",
+        "Train one seed and compare its curve with reference runs.",
+        "mjlab.scripts.verify:command",
+        "TASK",
+        "Train a task with one seed and say whether its learning curve lies within the band of the "
+        "reference runs\nthat ship with the package. Exit status: 0 within, 1 outside, 2 for a bad call.",
+        (
+            "verify Mjlab-Cartpole-Swingup",
+            "verify Mjlab-Velocity-Flat-Unitree-Go1 --device cpu --seed 1",
+        ),
+        unknown_task_status=2,
+    ),
+    Command(
+        "evaluate",
+        "Policies",
+        "Score a policy over many episodes.",
+        "mjlab.scripts.evaluate:command",
+        "TASK",
+        "Play episodes with a trained policy, one per environment, and print the mean return with a "
+        "95 % interval,\nand the success rate where the task defines success.",
+        (
+            "evaluate Mjlab-Cartpole-Swingup",
+            "evaluate Mjlab-Cartpole-Swingup --num-episodes 1024 --json True",
+        ),
+    ),
+    Command(
+        "play",
+        "Policies",
+        "Watch a policy in the browser, in MuJoCo's window, or as a video.",
+        "mjlab.scripts.play:command",
+        "TASK",
+        "Show a trained policy (the newest, unless one is named) in the browser, in MuJoCo's window, or "
+        "as a video.",
+        (
+            "play Mjlab-Cartpole-Swingup",
+            "play Mjlab-Cartpole-Swingup --checkpoint-file logs/rsl_rl/cartpole/model_500.pt",
+            "play Mjlab-Cartpole-Swingup --agent random --viewer native",
+            "play Mjlab-Cartpole-Swingup --viewer none --num-steps 200 --video True",
+        ),
+    ),
+    Command(
+        "demo",
+        "Policies",
+        "Watch a bundled policy: a walking quadruped or humanoid.",
+        "mjlab.scripts.demo:command",
+        details="""\
+Play a robot that follows velocity commands, in the browser and offline: a Unitree Go1 (quadruped,
+`go1`, the default) or G1 (humanoid, `g1`). Flags are those of `play`.""",
+        examples=(
+            "demo",
+            "demo g1",
+            "demo --num-envs 4 --port 8090",
+            "demo g1 --viewer none --video True",
+        ),
+    ),
+    Command(
+        "list-envs",
+        "Tasks",
+        "List the registered tasks and their profiles.",
+        "mjlab.scripts.list_envs:command",
+    ),
+    Command(
+        "profile-env",
+        "Tasks",
+        "Measure the time of a step by phase and term.",
+        "mjlab.scripts.profile_env:command",
+        "TASK",
+        "Step a task with random actions, and print the time of a step by phase (physics, forward, each "
+        "manager)\nand by term.",
+        (
+            "profile-env Mjlab-Cartpole-Swingup",
+            "profile-env Mjlab-Cartpole-Swingup --num-envs 4096 --steps 200 --json",
+        ),
+    ),
+    Command(
+        "export-scene",
+        "Tasks",
+        "Write the scene of a task, or a robot, as MuJoCo XML.",
+        "mjlab.scripts.export_scene:command",
+        "TARGET",
+        """\
+Write scene.xml and the files it refers to, for MuJoCo's own viewer and other programs.
 
-    exit_status = 2
+TARGET is the name of a task (`mjlab list-envs`), a robot (g1, go1, yam), or module:function, a function
+that returns an EntityCfg.
+
+flags:
+    --output-dir DIR    folder to write into, which must be new or empty (default: export)
+    --zip               write the archive DIR.zip instead of a folder
+    --overwrite         replace an earlier export there; other files are left alone""",
+        (
+            "export-scene Mjlab-Velocity-Flat-Unitree-Go1 --output-dir go1_flat",
+            "export-scene g1 --zip",
+        ),
+    ),
+    Command(
+        "visualize-terrain",
+        "Tasks",
+        "Show terrains in the browser.",
+        "mjlab.scripts.visualize_terrain:command",
+    ),
+    Command(
+        "viz-nan",
+        "Data",
+        "Show the states that led to a NaN in the browser.",
+        "mjlab.scripts.viz_nan:command",
+        "DUMP",
+        """\
+Show the states that led to a NaN. DUMP is a file that `train --enable-nan-guard True` wrote, such as
+nan_dump_latest.npz; the model is read from the same folder.
+
+flags:
+    --host ADDRESS      address to serve on; 0.0.0.0 is the whole network (default: 127.0.0.1)
+    --port N            port to serve on; the next free one where it is taken (default: 8080)""",
+        ("viz-nan /tmp/mjlab/nan_dumps/nan_dump_latest.npz",),
+    ),
+    Command(
+        "csv-to-npz",
+        "Data",
+        "Convert recorded joint angles into a motion to track.",
+        "mjlab.scripts.csv_to_npz:command",
+        "--input-file FILE",
+        """\
+Turn a CSV of the retargeted LAFAN1 sets (one pose a line: position of the root, its quaternion x y z w,
+all joint angles) into the .npz that motion tracking reads; or an .npz into one of another rate.
+`--help` with another flag lists all flags.""",
+        (
+            "mjlab csv-to-npz --input-file dance1_subject2.csv",
+            'mjlab csv-to-npz --input-file dance.csv --line-range "(120,720)" '
+            "--output-file dance.npz --render True",
+            "mjlab csv-to-npz --input-file dance.csv --view True",
+        ),
+    ),
+    Command(
+        "completion",
+        "Shell",
+        "Print a script that completes commands and task names (bash, zsh, fish).",
+        "mjlab.scripts.completion:command",
+    ),
+)
+
+ALIASES = (
+    "train", "train-seeds", "plot-seeds", "verify", "evaluate", "play", "demo", "list-envs",
+    "list_envs", "profile-env", "export-scene", "viz-nan",
+)  # fmt: skip
+"""Commands that are installed by themselves as well."""
+
+_BY_NAME = {command.name: command for command in COMMANDS}
+
+
+def main() -> None:
+    """Entry point of `mjlab`."""
+    run_command(_dispatch)
+
+
+def _dispatch(argv: list[str]) -> None:
+    if not argv or argv[0] in ("-h", "--help"):
+        print(overview())
+        return
+    if argv[0] == "--version":
+        from importlib.metadata import version
+
+        print(version("mjlab"))
+        return
+    name = argv[0].replace("_", "-")
+    if name not in _BY_NAME:
+        from mjlab.utils.string import suggest
+
+        raise BadCallError(f"Unknown command {argv[0]!r}; {suggest(name, _BY_NAME)}")
+    run_subcommand(_BY_NAME[name], argv[1:], f"mjlab {name}")
+
+
+def overview() -> str:
+    """Return what `mjlab --help` prints: all commands, by group."""
+    lines = ["usage: mjlab COMMAND [arguments]", ""]
+    lines += ["Train and evaluate robot policies in thousands of parallel MuJoCo environments.", ""]
+    width = max(map(len, _BY_NAME))
+    for group in dict.fromkeys(command.group for command in COMMANDS):
+        lines.append(group)
+        lines += [f"  {c.name:<{width}}  {c.summary}" for c in COMMANDS if c.group == group]
+        lines.append("")
+    lines.append(
+        "`mjlab COMMAND --help` describes a command; `mjlab --version` prints the version."
+    )
+    return "\n".join(lines)
+
+
+def run_subcommand(command: Command, argv: list[str], prog: str) -> None:
+    """Run a subcommand. Its first argument is checked before heavy modules are imported."""
+    argument = command.argument
+    # After its first argument, `--help` lists all flags.
+    asks_help = argv[:1] in (["-h"], ["--help"]) and (argument or command.details)
+    if asks_help or (argument and not argv):
+        print(command.usage(prog))
+        return
+    if argument and argv[0].startswith("-") and not argument.startswith("-"):
+        raise UserError(f"Expected {argument} first, got {argv[0]!r}.\n\n{command.usage(prog)}")
+    if argument == "TASK":
+        from mjlab.tasks.registry import UnknownTaskError, require_task
+
+        try:
+            require_task(argv[0])
+        except UnknownTaskError as error:
+            error.exit_status = command.unknown_task_status
+            raise
+    module, _, function = command.function.partition(":")
+    getattr(importlib.import_module(module), function)(argv, prog)
+
+
+def run_alias(name: str) -> NoReturn:
+    """Run the subcommand `name` with the arguments of this process, and exit."""
+    run_command(lambda argv: run_subcommand(_BY_NAME[name], argv, name))
+
+
+# Entry points of the commands that are installed by themselves as well.
+
+
+def train() -> None:
+    """Entry point of `train`."""
+    run_alias("train")
+
+
+def train_seeds() -> None:
+    """Entry point of `train-seeds`."""
+    run_alias("train-seeds")
+
+
+def plot_seeds() -> None:
+    """Entry point of `plot-seeds`."""
+    run_alias("plot-seeds")
+
+
+def verify() -> None:
+    """Entry point of `verify`."""
+    run_alias("verify")
+
+
+def evaluate() -> None:
+    """Entry point of `evaluate`."""
+    run_alias("evaluate")
+
+
+def play() -> None:
+    """Entry point of `play`."""
+    run_alias("play")
+
+
+def demo() -> None:
+    """Entry point of `demo`."""
+    run_alias("demo")
+
+
+def list_envs() -> None:
+    """Entry point of `list-envs` and `list_envs`."""
+    run_alias("list-envs")
+
+
+def profile_env() -> None:
+    """Entry point of `profile-env`."""
+    run_alias("profile-env")
+
+
+def export_scene() -> None:
+    """Entry point of `export-scene`."""
+    run_alias("export-scene")
+
+
+def viz_nan() -> None:
+    """Entry point of `viz-nan`."""
+    run_alias("viz-nan")
+
+
+# Errors.
 
 
 def run_command(command: Callable[[list[str]], None]) -> NoReturn:
     """Run `command` with the command line's arguments and exit.
 
-    An error that a user can mend is printed as one message, and the exit status is 1 or that of a
-    `UserError`. Anything else is a defect of the program and keeps its traceback.
+    An error that a user can fix (`MjlabError`, `ValueError`, `OSError`) is printed as one message,
+    and the exit status is that of the error, or 1. Other errors keep their traceback.
     """
     # torch's idle threads would otherwise spin, and take the cores from the physics threads.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    # Scripts report to people: plain messages of the libraries, and warnings as one line each.
+    # Plain messages of the libraries, and warnings as one line each.
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
     logging.getLogger("mjlab").setLevel(logging.INFO)
     logging.captureWarnings(True)
@@ -74,40 +400,41 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:
-        # Whoever read the output (`| head`) has seen enough. What is still buffered has nowhere
-        # to go, and Python would complain about it at exit.
+        # The reader (`| head`) has closed the pipe. Python would complain at exit about buffered
+        # output that cannot be written.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except Exception as error:
         if _is_out_of_memory(error):
-            # What was raised says where the memory ended, and not that it did.
+            # The original message says where the memory ended, not that it did.
             error = UserError(
                 f"Memory or threads are not enough ({_text(error)}). Use fewer environments, or raise "
                 "the limits (ulimit)."
             )
-        elif not isinstance(error, _user_errors()) and not _raised_on_purpose(error):
+        elif not isinstance(error, (MjlabError, ValueError, OSError)):
             raise
         if os.environ.get(TRACEBACK_VARIABLE):
             traceback.print_exc()
-        blameless = isinstance(error, _classes(_OTHER_PROCESS))
+        status = error.exit_status if isinstance(error, MjlabError) else 1
         rank = os.environ.get("RANK", "0")
-        # Of several processes, the one that failed and the first have something to say.
-        if rank == "0" or not blameless:
-            _print_error(error, rank)
-        status = error.exit_status if isinstance(error, UserError) else 1
-        sys.exit(OTHER_PROCESS_STATUS if blameless else status)
+        # Of several processes, only the one that failed and the first report.
+        if rank == "0" or status != OTHER_PROCESS_STATUS:
+            process = "" if rank == "0" else f" in process {rank}"
+            print(f"error{process}: {_text(error)}", file=sys.stderr)
+            print(f"(Set {TRACEBACK_VARIABLE}=1 for where it came from.)", file=sys.stderr)
+        sys.exit(status)
     sys.exit(0)
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    said = str(error)
-    return isinstance(error, MemoryError) or any(text in said for text in _OUT_OF_MEMORY)
+    message = str(error)
+    return isinstance(error, MemoryError) or any(text in message for text in _OUT_OF_MEMORY)
 
 
-def _print_error(error: BaseException, rank: str) -> None:
-    process = "" if rank == "0" else f" in process {rank}"
-    print(f"error{process}: {_text(error)}", file=sys.stderr)
-    print(f"(Set {TRACEBACK_VARIABLE}=1 for where it came from.)", file=sys.stderr)
+def _text(error: BaseException) -> str:
+    # A KeyError shows its text in quotes.
+    text = str(error.args[0] if isinstance(error, KeyError) and error.args else error).strip()
+    return shorten(text) if text else type(error).__name__
 
 
 def _one_line(
@@ -120,176 +447,5 @@ def _one_line(
     return f"{category.__name__}: {message}"
 
 
-def _user_errors() -> tuple[type[BaseException], ...]:
-    from mjlab.tasks.registry import UnknownTaskError
-
-    return (UserError, UnknownTaskError, ValueError, OSError, *_classes(*_LAZY_ERRORS))
-
-
-def _classes(*names: tuple[str, str]) -> tuple[type[BaseException], ...]:
-    # Classes of modules that were never imported cannot have been raised.
-    return tuple(
-        getattr(sys.modules[module_name], class_name)
-        for module_name, class_name in names
-        if module_name in sys.modules
-    )
-
-
-def _raised_on_purpose(error: BaseException) -> bool:
-    """Return whether `error` is a message of ours, such as a KeyError for an unknown entity.
-
-    Errors of other kinds than a user can mend are defects, unless a `raise` statement of this
-    package made them: then their text says what is wrong with a task.
-    """
-    frames = list(traceback.walk_tb(error.__traceback__))
-    if not frames or isinstance(error, AssertionError):
-        return False
-    frame, number = frames[-1]
-    line = linecache.getline(frame.f_code.co_filename, number)
-    ours = frame.f_globals.get("__name__", "").startswith("mjlab.")
-    return ours and line.lstrip().startswith("raise ")
-
-
-def _text(error: BaseException) -> str:
-    # A KeyError shows its text in quotes.
-    text = str(error.args[0] if isinstance(error, KeyError) and error.args else error).strip()
-    return _cut(text) if text else type(error).__name__
-
-
-def _cut(text: str) -> str:
-    """Return `text`; if it is of a damaged file, say, only its beginning and its end."""
-    half = _LONGEST_MESSAGE // 2
-    return text if len(text) <= _LONGEST_MESSAGE else f"{text[:half]} [...] {text[-half:]}"
-
-
-def tell(message: str) -> None:
-    """Print a notice for people. Standard output is left to what the command is asked for."""
-    print(_cut(message), file=sys.stderr, flush=True)
-
-
-def first_and_flags(
-    argv: list[str], usage: str, what: str, may_ask_help: list[str]
-) -> tuple[str, list[str]]:
-    """Split the command line into `what` comes first, and the flags.
-
-    Without arguments, or with `--help` among `may_ask_help`, prints `usage` and exits.
-
-    Raises:
-        UserError: flags before it.
-    """
-    if not argv or {"-h", "--help"} & set(may_ask_help):
-        print(usage)
-        sys.exit(0)
-    if argv[0].startswith("-"):
-        raise UserError(f"The {what} comes first, before {argv[0]!r}.\n\n{usage}")
-    return argv[0], argv[1:]
-
-
-def task_and_flags(argv: list[str], usage: str) -> tuple[str, list[str]]:
-    """Split the command line into the task's name, which comes first, and its flags.
-
-    Without arguments, or with only `--help`, prints `usage` and exits.
-
-    Raises:
-        UnknownTaskError: no such task; the message lists the nearest names.
-        UserError: flags before the task.
-    """
-    task, flags = first_and_flags(argv, usage, "task's name", argv[:1])
-    from mjlab.tasks.registry import require_task
-
-    require_task(task)
-    return task, flags
-
-
-def parse_flags(config_type: type[C], default: C, flags: list[str], prog: str) -> C:
-    """Return `default` with the fields replaced that `flags` name; exits on an unknown flag.
-
-    `--env.rewards.<term> None`, and the like for every other kind of term, switches the term off;
-    `None` also removes a config inside another where the field may be None, such as a term's noise.
-    """
-    import tyro
-
-    arguments = _arguments(config_type, default, flags, prog)
-    return tyro.cli(config_type, **arguments)
-
-
-def parse_known_flags(
-    config_type: type[C], default: C, flags: list[str], prog: str
-) -> tuple[C, list[str]]:
-    """Return what `parse_flags` does, and the flags that are unknown, which have no effect."""
-    import tyro
-
-    arguments = _arguments(config_type, default, flags, prog)
-    return tyro.cli(config_type, return_unknown_args=True, **arguments)
-
-
-def _arguments(config_type: Any, default: Any, flags: list[str], prog: str) -> dict[str, Any]:
-    import mjlab
-    from mjlab.scripts.flag_values import flag_rules
-    from mjlab.scripts.switch_off import switch_terms_off
-
-    edited, flags = switch_terms_off(default, flags)
-    return {
-        "default": edited,
-        "args": _with_explicit_switches(config_type, flags),
-        "prog": prog,
-        "config": mjlab.TYRO_FLAGS,
-        "registry": flag_rules(),
-    }
-
-
-def is_given(flag: str, flags: list[str]) -> bool:
-    """Return whether the command line `flags` sets `flag`, with `-` or `_` between its words."""
-    return any(word.partition("=")[0].replace("_", "-") == flag for word in flags)
-
-
-def _with_explicit_switches(config_type: Any, flags: list[str]) -> list[str]:
-    """Read a bare `--video` as `--video True`, for the switches of `config_type` itself."""
-    switches = {
-        "--" + field.name.replace("_", "-")
-        for field in fields(config_type)
-        if field.type in ("bool", bool)
-    }
-    explicit: list[str] = []
-    for position, flag in enumerate(flags):
-        explicit.append(flag)
-        following = flags[position + 1] if position + 1 < len(flags) else None
-        bare = following is None or following.startswith("--")
-        if flag.replace("_", "-") in switches and bare:
-            explicit.append("True")
-    return explicit
-
-
-def resolve_device(device: str | None) -> str:
-    """Return the torch device to use: the one asked for, else a GPU where there is one.
-
-    Raises:
-        UserError: a CUDA device without a usable GPU, or a name that torch does not know.
-    """
-    import torch
-
-    if device is None:
-        return "cuda:0" if torch.cuda.is_available() else "cpu"
-    try:
-        kind = torch.device(device).type
-    except RuntimeError as error:
-        raise UserError(
-            f"{device!r} is not a device. Use cpu, cuda, or cuda:0, cuda:1, ..."
-        ) from error
-    if kind == "cuda" and not torch.cuda.is_available():
-        raise UserError(
-            f"--device {device} was asked for, but torch finds no CUDA GPU here "
-            f"(torch {torch.__version__}). Use --device cpu, or install a driver and a CUDA build "
-            "of torch."
-        )
-    return "cuda:0" if device == "cuda" else device
-
-
-def task_usage(name: str, purpose: str, examples: list[str]) -> str:
-    """Return the short help that is printed when no task is named."""
-    lines = [f"usage: {name} TASK [flags]", "", purpose, ""]
-    lines += ["examples:", *(f"    uv run {example}" for example in examples), ""]
-    lines += [
-        f"`{name} TASK --help` lists every flag of the task; `list-envs` lists the tasks.",
-    ]
-    return "\n".join(lines)
+if __name__ == "__main__":
+    main()

@@ -1,49 +1,304 @@
-"""Turn joint angles into a motion: `python -m mjlab.scripts.csv_to_npz --input-file FILE`."""
+"""Turn joint angles into a motion: `mjlab csv-to-npz --input-file FILE`."""
 
 from __future__ import annotations
 
+import importlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import mujoco
+from mjviser import ViserMujocoScene
+
 from mjlab.compat import older_names
-from mjlab.scripts.cli import run_command
+from mjlab.scripts.cli import run_alias
+from mjlab.scripts.flags import parse_flags
+from mjlab.tasks.tracking.motion_file import Motion, npz_path, read_motion, write_motion
+from mjlab.tasks.tracking.motion_recording import (
+    Recording,
+    make_motion,
+    read_csv,
+    recording_of,
+    resampled,
+)
+from mjlab.utils.errors import UserError
+from mjlab.utils.logging import print_notice
+from mjlab.viewer.page_server import check_address, page_url, serve_page
 
 if TYPE_CHECKING:
-    from mjlab.scripts.csv_to_npz_run import CsvToNpzConfig as CsvToNpzConfig
+    import mujoco
+    import viser
 
-_USAGE = """usage: python -m mjlab.scripts.csv_to_npz --input-file FILE [flags]
-
-Turn a CSV of the retargeted LAFAN1 sets (one pose a line: position of the root, its quaternion x y z w,
-all joint angles) into the .npz that motion tracking reads; or an .npz into one of another rate.
-
-    python -m mjlab.scripts.csv_to_npz --input-file dance1_subject2.csv
-    python -m mjlab.scripts.csv_to_npz --input-file dance.csv --line-range "(120,720)" \\
-        --output-file dance.npz --render True
-    python -m mjlab.scripts.csv_to_npz --input-file dance.csv --view True
-
-`--help` with another flag lists all flags."""
+    from mjlab.entity import Entity
+    from mjlab.tasks.tracking.motion_file import Motion
+_WANDB_PROJECT = "csv_to_npz"
+_ARTIFACT_TYPE = "motions"
+# As mjlab 1.6 calls it, so that its `play` finds it.
+_ARTIFACT_FILE = "motion.npz"
+_VIDEO_SIZE = (480, 640)
+__getattr__ = older_names(__name__)
 
 
-def __getattr__(name: str) -> Any:
-    if name in ("CsvToNpzConfig", "convert"):
-        from mjlab.scripts import csv_to_npz_run
+@dataclass
+class CsvToNpzConfig:
+    """Flags of `csv_to_npz`."""
 
-        return getattr(csv_to_npz_run, name)
-    return older_names(__name__)(name)
+    input_file: str = ""
+    """The recording: a .csv of poses, or a motion (.npz)."""
+    output_file: str | None = None
+    """Where the motion goes. None: beside the working folder's other files, as `output_name`."""
+    output_name: str | None = None
+    """Name of the motion, and of the artifact that is uploaded. None: that of the input."""
+    input_fps: float = 30.0
+    """Poses per second of a .csv; an .npz says so itself."""
+    output_fps: float = 50.0
+    """Frames per second of the motion: the task's control rate."""
+    line_range: tuple[int, int] | None = None
+    """First and last line (or frame) to take, counted from 1; both are taken. None takes all."""
+    robot: str = "g1"
+    """The robot: g1, go1, or `module:function` that returns its EntityCfg."""
+    render: bool = False
+    """Record the motion as a video beside the output."""
+    view: bool = False
+    """Serve a page in the browser that plays the motion."""
+    port: int = 8080
+    """Port of that page; the next free one where it is taken."""
+    host: str = field(default="127.0.0.1", kw_only=True)
+    """Address that it is served on; 0.0.0.0 serves the whole network."""
+    upload: bool = False
+    """Upload the motion to Weights & Biases as an artifact, and link it into the registry."""
+    device: str | None = None
+    """Without effect, for scripts that were written for mjlab 1.6: the conversion is a matter of
+    seconds on the CPU."""
 
 
-def _command(argv: list[str]) -> None:
-    if not argv or argv in (["-h"], ["--help"]):
-        print(_USAGE)
-        return
-    from mjlab.scripts.cli import parse_flags
-    from mjlab.scripts.csv_to_npz_run import CsvToNpzConfig, convert
+def command(argv: list[str], prog: str) -> None:
+    """Run `mjlab csv-to-npz`."""
+    convert(parse_flags(CsvToNpzConfig, CsvToNpzConfig(), argv, prog=prog))
 
-    convert(parse_flags(CsvToNpzConfig, CsvToNpzConfig(), argv, prog="csv_to_npz"))
+
+def convert(cfg: CsvToNpzConfig) -> Path:
+    """Convert as `cfg` says; return the path of the motion.
+
+    Raises:
+        UserError, ValueError: a flag makes no sense.
+        MotionFileError: the input is no recording of this robot.
+    """
+    if not cfg.input_file:
+        raise UserError("--input-file names the recording, a .csv or an .npz.")
+    for name in ("input_fps", "output_fps"):
+        if not getattr(cfg, name) > 0.0:
+            flag = name.replace("_", "-")
+            raise UserError(f"--{flag} is {getattr(cfg, name)}; it has to be above 0.")
+    if cfg.view:
+        check_address(cfg.host, cfg.port, "--")
+    robot = _robot(cfg.robot)
+    source = Path(cfg.input_file)
+    name = cfg.output_name or source.stem
+    target = npz_path(cfg.output_file or f"{name}.npz")
+    if target.resolve() == source.resolve():
+        raise UserError(f"The output {target} would overwrite the input; give --output-file.")
+    recording = _read(cfg, source, robot)
+    model = robot.compile()
+    motion = make_motion(
+        resampled(recording, cfg.output_fps), model, robot.joint_names, robot.body_names
+    )
+    path = write_motion(target, motion)
+    print(
+        f"Motion: {path}, {motion.num_frames} frames, {motion.num_frames / cfg.output_fps:.2f} s "
+        f"at {cfg.output_fps:g} per second"
+    )
+    if cfg.render:
+        record_motion(motion, robot, path.with_suffix(".mp4"))
+    if cfg.upload:
+        _upload(path, name)
+    if cfg.view:
+        show_motion(motion, _stage(robot), cfg.host, cfg.port)
+    return path
+
+
+def _read(cfg: CsvToNpzConfig, source: Path, robot: Entity) -> Recording:
+    if source.suffix != ".npz":
+        return read_csv(source, cfg.input_fps, robot.joint_names, cfg.line_range)
+    motion = read_motion(source)
+    recording = recording_of(motion, motion.fps or cfg.input_fps)
+    if cfg.line_range is None:
+        return recording
+    first, last = cfg.line_range
+    if not 1 <= first < last <= len(recording):
+        raise UserError(
+            f"--line-range is {cfg.line_range}; {source} has frames 1 to {len(recording)}, of which "
+            "at least two are needed."
+        )
+    kept = slice(first - 1, last)
+    return Recording(
+        fps=recording.fps,
+        root_pos=recording.root_pos[kept],
+        root_quat=recording.root_quat[kept],
+        joint_pos=recording.joint_pos[kept],
+    )
+
+
+def _robot(name: str) -> Entity:
+    """Return the robot of that name, or of `module:function`."""
+    from mjlab.asset_zoo.robots import get_g1_robot_cfg, get_go1_robot_cfg
+
+    known: dict[str, Callable[[], Any]] = {"g1": get_g1_robot_cfg, "go1": get_go1_robot_cfg}
+    if name in known:
+        return known[name]().build()
+    module, colon, function = name.partition(":")
+    if not colon:
+        raise UserError(
+            f"--robot is {name!r}; it is one of {', '.join(known)}, or `module:function` that "
+            "returns an EntityCfg."
+        )
+    try:
+        make = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        raise UserError(f"--robot {name}: {error}.") from error
+    return make().build()
+
+
+def _stage(robot: Entity) -> mujoco.MjModel:
+    """Return the robot on a floor, to look at."""
+    import mujoco
+
+    spec = robot.cfg.build().spec
+    floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE)
+    floor.size, floor.rgba = (10.0, 10.0, 0.1), (0.75, 0.78, 0.82, 1.0)
+    spec.worldbody.add_light(pos=(1.0, -1.0, 4.0), dir=(-0.2, 0.2, -1.0))
+    return spec.compile()
+
+
+def record_motion(motion: Motion, robot: Entity, path: Path) -> None:
+    """Write a video of the motion."""
+    import mujoco
+
+    from mjlab.utils.wrappers.video_recorder import ClipWriter
+    from mjlab.viewer.offscreen_renderer import open_renderer
+
+    model = _stage(robot)
+    data, camera, option = mujoco.MjData(model), mujoco.MjvCamera(), mujoco.MjvOption()
+    camera.distance, camera.azimuth, camera.elevation = 3.0, 120.0, -10.0
+    renderer = open_renderer(model, *_VIDEO_SIZE)
+    writer = ClipWriter(path, motion.fps or 50.0)
+    try:
+        for frame in range(motion.num_frames):
+            pose(model, data, motion, frame)
+            camera.lookat = data.subtree_com[0]
+            renderer.update_scene(data, camera, option)
+            writer.add(renderer.render())
+    finally:
+        renderer.close()
+        written = writer.close()
+    print(f"Video:  {written}")
+
+
+def pose(model: mujoco.MjModel, data: mujoco.MjData, motion: Motion, frame: int) -> None:
+    """Put a robot, whose free joint comes first, onto a frame of its motion."""
+    import mujoco
+
+    data.qpos[:3], data.qpos[3:7] = motion.body_pos_w[frame, 0], motion.body_quat_w[frame, 0]
+    data.qpos[7:] = motion.joint_pos[frame]
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+
+
+def _upload(path: Path, name: str) -> None:
+    """Upload a motion as an artifact, and link it into the registry of motions.
+
+    Raises:
+        UserError: Weights & Biases does not take it.
+    """
+    try:
+        _send(path, name)
+    except Exception as error:
+        # wandb raises errors of many kinds, of its own and of what it is built on.
+        raise UserError(f"{path} cannot be uploaded to Weights & Biases: {error}") from error
+    print_notice(f"Uploaded as wandb-registry-{_ARTIFACT_TYPE}/{name}.")
+
+
+def _send(path: Path, name: str) -> None:
+    import wandb
+
+    run = wandb.init(project=_WANDB_PROJECT, name=name)
+    try:
+        artifact = wandb.Artifact(name=name, type=_ARTIFACT_TYPE)
+        artifact.add_file(str(path), name=_ARTIFACT_FILE)
+        logged = run.log_artifact(artifact)
+        run.link_artifact(logged, target_path=f"wandb-registry-{_ARTIFACT_TYPE}/{name}")
+    finally:
+        run.finish()
+
+
+# The page.
+
+
+def show_motion(motion: Motion, model: mujoco.MjModel, host: str, port: int) -> None:
+    """Serve the page until Ctrl-C."""
+    server = serve_page(host, port)
+    page = MotionPage(server, motion, model)
+    print(f"Open {page_url(server)} in a browser. Ctrl-C ends.", flush=True)
+    last = time.perf_counter()
+    try:
+        while True:
+            now = time.perf_counter()
+            page.advance(now - last)
+            last = now
+            time.sleep(1.0 / 50.0)
+    finally:
+        server.stop()
+
+
+class MotionPage:
+    """Shows a robot on a frame of a motion, which runs by itself or follows a slider."""
+
+    def __init__(self, server: viser.ViserServer, motion: Motion, model: mujoco.MjModel) -> None:
+        """Add robot and controls.
+
+        Args:
+            server: The page's server.
+            motion: The motion.
+            model: Its robot, whose free joint comes first, with whatever stands around it.
+        """
+        self._motion, self._model = motion, model
+        self._data = mujoco.MjData(model)
+        self._scene = ViserMujocoScene(server, model, num_envs=1)
+        self._playing = server.gui.add_checkbox("Play", True)
+        self._speed = server.gui.add_slider("Speed", 0.1, 2.0, 0.1, 1.0)
+        self._slider = server.gui.add_slider("Frame", 0, motion.num_frames - 1, 1, 0)
+        self._slider.on_update(self._chosen)
+        self._frame = 0.0
+        self._shown: int | None = None
+
+    @property
+    def frame(self) -> int:
+        """The frame that is shown."""
+        return int(self._frame)
+
+    def advance(self, seconds: float) -> None:
+        """Show the frame that is due after so much time; the motion begins anew at its end."""
+        if self._playing.value:
+            self._frame += seconds * (self._motion.fps or 50.0) * self._speed.value
+            self._frame %= self._motion.num_frames
+            self._slider.value = self.frame
+        if self._shown != self.frame:
+            self._shown = self.frame
+            pose(self._model, self._data, self._motion, self.frame)
+            self._scene.update_from_mjdata(self._data)
+
+    def _chosen(self, event: Any) -> None:
+        # What the page itself sets has no client.
+        if event.client is not None:
+            self._playing.value = False
+            self._frame = float(self._slider.value)
 
 
 def main() -> None:
-    """Entry point."""
-    run_command(_command)
+    """Entry point of `csv-to-npz`."""
+    run_alias("csv-to-npz")
 
 
 if __name__ == "__main__":

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mjlab.scripts.cli import UserError, parse_flags, run_command
+from mjlab.scripts.cli import run_alias
+from mjlab.utils.errors import UserError, check_one_of
 
 if TYPE_CHECKING:
-    from mjlab.scripts.play_run import PlayConfig
+    from mjlab.scripts.play import PlayConfig
 
 _FOLDER = Path(__file__).parents[1] / "demo"
 
@@ -31,20 +32,10 @@ DEMOS = {
     "g1": Demo("Mjlab-Velocity-Flat-Unitree-G1", "cpu", _FOLDER / "g1_velocity.onnx"),
 }
 
-_USAGE = """usage: demo [go1|g1] [flags]
-
-Play a robot that walks as told, in the browser and offline: a Unitree Go1 (quadruped, also without a name)
-or G1 (humanoid). Flags are those of `play`:
-
-    uv run demo
-    uv run demo g1
-    uv run demo --num-envs 4 --port 8090
-    uv run demo g1 --viewer none --video True"""
-
 
 def demo_cfg(demo: Demo) -> PlayConfig:
     """Return what `demo` plays unless flags say otherwise: one robot, on the CPU, in the browser."""
-    from mjlab.scripts.play_run import PlayConfig
+    from mjlab.scripts.play import PlayConfig
     from mjlab.scripts.policy import policy_env_cfg
     from mjlab.sensor import RayCastSensorCfg
 
@@ -69,7 +60,7 @@ def run_demo(demo: Demo, cfg: PlayConfig) -> None:
     Raises:
         UserError: the policy is not there, or what was asked for cannot be done.
     """
-    from mjlab.scripts.play_run import run_play
+    from mjlab.scripts.play import run_play
 
     plays_its_own = cfg.agent == "trained" and cfg.checkpoint_file == str(demo.policy)
     if plays_its_own and not demo.policy.is_file():
@@ -80,22 +71,20 @@ def run_demo(demo: Demo, cfg: PlayConfig) -> None:
     run_play(demo.task, cfg)
 
 
-def _command(argv: list[str]) -> None:
-    if argv[:1] in (["-h"], ["--help"]):
-        print(_USAGE)
-        return
-    from mjlab.scripts.play_run import PlayConfig
-
+def command(argv: list[str], prog: str) -> None:
+    """Run `demo`."""
     name, flags = ("go1", argv) if not argv or argv[0].startswith("-") else (argv[0], argv[1:])
-    if name not in DEMOS:
-        raise UserError(f"demo: expected one of {', '.join(DEMOS)}, got {name!r}.")
+    check_one_of("demo", name, DEMOS)
+    from mjlab.scripts.flags import parse_flags
+    from mjlab.scripts.play import PlayConfig
+
     demo = DEMOS[name]
-    run_demo(demo, parse_flags(PlayConfig, demo_cfg(demo), flags, prog=f"demo {name}"))
+    run_demo(demo, parse_flags(PlayConfig, demo_cfg(demo), flags, prog=f"{prog} {name}"))
 
 
 def main() -> None:
     """Entry point of `demo`."""
-    run_command(_command)
+    run_alias("demo")
 
 
 if __name__ == "__main__":

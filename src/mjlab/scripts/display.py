@@ -1,4 +1,4 @@
-"""What a person sees while a policy trains: one live panel, or plain lines where no terminal is."""
+"""Training in the terminal: a live panel, or plain lines in a log file; results at the end."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import stat
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console, Group
@@ -17,9 +18,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
+from mjlab.sim.warning_log import mujoco_warnings
 
 if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
     from mjlab.rl.evaluation import EvaluationResult
+    from mjlab.scripts.run_folder import NewRunFolder, SharedRunFolder
+    from mjlab.scripts.train_config import TrainConfig
 
 # Plain lines are for log files: often enough to follow, rarely enough to read.
 _SECONDS_BETWEEN_LINES = 5.0
@@ -176,3 +181,61 @@ def duration(seconds: float) -> str:
         return f"{minutes}:{rest:02d} min"
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d} h"
+
+
+class KeepRunFolder(TrainingObserver):
+    """Keeps the run's folder once training has started."""
+
+    def __init__(self, folder: NewRunFolder | SharedRunFolder) -> None:
+        self._folder = folder
+
+    def on_start(self, first_iteration: int, total_iterations: int) -> None:
+        """Keep the folder."""
+        self._folder.keep()
+
+
+def report_divergence(env: ManagerBasedRlEnv) -> None:
+    """Print how many environments diverged, and MuJoCo's warnings."""
+    episodes = int(env.nan_resets.sum())
+    if episodes > 0:
+        environments = int((env.nan_resets > 0).sum())
+        print(
+            f"Diverged: the physics of {environments} of {env.num_envs} environments, in {episodes} "
+            "episodes (Simulation/nan_resets)"
+        )
+    for kind, count in mujoco_warnings().items():
+        print(f"MuJoCo warned {count:,} times: {kind}")
+
+
+def leave_results(task: str, cfg: TrainConfig, run_dir: Path, device: str) -> None:
+    """Draw the learning curve and, if asked to, record the trained policy; list the files."""
+    from mjlab.rl.checkpoint import latest_checkpoint
+    from mjlab.rl.plot import plot_run
+
+    # A run that is solved as it is resumed has no iteration of its own.
+    with contextlib.suppress(ValueError):
+        plot_run(run_dir, run_dir / "learning_curve.png", title=task)
+    checkpoint = latest_checkpoint(run_dir)
+    if cfg.result_video and checkpoint is not None:
+        from mjlab.scripts.flags import prepare_env_cfg
+        from mjlab.scripts.policy import VideoCfg, policy_env_cfg, record_policy
+        from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
+
+        env_cfg = policy_env_cfg(task, cfg.profile, purpose="play")
+        prepare_env_cfg(task, None, env_cfg, checkpoint)
+        try:
+            record_policy(
+                task,
+                env_cfg,
+                checkpoint,
+                run_dir / "videos",
+                device,
+                VideoCfg(profile=cfg.profile),
+            )
+        except RenderingUnavailableError as error:
+            print(f"No video: {error}")
+    print("Results:")
+    for pattern in ("model_*.pt", "*.onnx", "*.png", "videos/**/*.mp4"):
+        files = sorted(run_dir.glob(pattern), key=lambda path: path.stat().st_mtime)
+        if files:
+            print(f"    {files[-1]}")

@@ -2,44 +2,153 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
-from mjlab.scripts.cli import is_given, run_command, task_and_flags, task_usage
-
-if TYPE_CHECKING:
-    from mjlab.scripts.evaluate_run import EvaluateConfig as EvaluateConfig
-
-_USAGE = task_usage(
-    "evaluate",
-    "Play episodes with a trained policy, one per environment, and print the mean return with a "
-    "95 % interval, and the success rate where the task defines success.",
-    [
-        "evaluate Mjlab-Cartpole-Swingup",
-        "evaluate Mjlab-Cartpole-Swingup --num-episodes 1024 --json True",
-    ],
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.scripts.cli import run_alias
+from mjlab.scripts.devices import resolve_device
+from mjlab.scripts.environments import make_env
+from mjlab.scripts.flags import is_given
+from mjlab.scripts.policy import (
+    PolicyFlags,
+    env_cfg_of,
+    find_checkpoint,
+    make_policy,
+    parse_policy_flags,
+    policy_env_cfg,
 )
+from mjlab.tasks.registry import load_rl_cfg
+from mjlab.utils.errors import UserError
 
 
-def __getattr__(name: str) -> Any:
-    if name in ("EvaluateConfig", "run_evaluate"):
-        from mjlab.scripts import evaluate_run
+@dataclass
+class EvaluateConfig(PolicyFlags):
+    """Flags of `evaluate`."""
 
-        return getattr(evaluate_run, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    num_episodes: int = 256
+    """Episodes to play, one per environment; in rounds if --env.scene.num-envs is set lower."""
+    max_steps: int | None = None
+    """Steps after which an episode is cut off, and is no success; None is the episode length of
+    evaluations."""
+    seed: int = 0
+    """Seed of the evaluation."""
+    json: bool = False
+    """Print only JSON."""
 
 
-def _command(argv: list[str]) -> None:
-    task, flags = task_and_flags(argv, _USAGE)
-    from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
-    from mjlab.scripts.policy import parse_policy_flags
-
-    cfg = parse_policy_flags(EvaluateConfig, flags, task, "evaluate", purpose="evaluate")
+def command(argv: list[str], prog: str) -> None:
+    """Run `evaluate`."""
+    task, *flags = argv
+    cfg = parse_policy_flags(EvaluateConfig, flags, task, prog, purpose="evaluate")
     run_evaluate(task, cfg, keep_num_envs=is_given("--env.scene.num-envs", flags))
+
+
+def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False) -> dict[str, Any]:
+    """Score a policy of `task`, print the figures, and return them.
+
+    The environments are those of evaluations in training (`EvaluationCfg.prepare_env`): those of the
+    task's training config where it has none, because the time limit is part of the task. There is
+    one for each episode, unless `cfg.env` has another number of them than the task, or
+    `keep_num_envs` says that its number was chosen.
+    """
+    from mjlab.rl.evaluation import evaluate_policy, required_return, success_definition
+
+    if cfg.num_episodes < 1:
+        raise UserError(f"--num-episodes is {cfg.num_episodes}; at least 1 has to be played.")
+    device = resolve_device(cfg.device)
+    checkpoint = find_checkpoint(task, cfg)
+    env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="evaluate")
+    solved = load_rl_cfg(task, profile=cfg.profile).evaluation
+    env = make_env(
+        task,
+        env_cfg,
+        device,
+        _num_envs(task, cfg, env_cfg, keep_num_envs),
+        cfg.engine,
+        seed=cfg.seed,
+        profile=cfg.profile,
+    )
+    try:
+        policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
+        result = evaluate_policy(
+            env,
+            policy,
+            cfg.num_episodes,
+            max_steps=cfg.max_steps,
+            success_return=required_return(solved),
+            success_func=solved.success_func,
+            success_is_survival=solved.success_is_survival,
+            metrics=solved.metrics,
+            seed=cfg.seed,
+        )
+        physics = env.unwrapped.sim.capabilities.description
+        num_envs = env.num_envs
+    finally:
+        env.close()
+    figures = {
+        "task": task,
+        "policy": cfg.agent if checkpoint is None else str(checkpoint),
+        "physics": physics,
+        "seed": cfg.seed,
+        "num_envs": num_envs,
+        "success_definition": success_definition(solved),
+        **result.to_dict(),
+    }
+    print(json.dumps(figures, indent=2) if cfg.json else _table(figures))
+    return figures
+
+
+def _num_envs(
+    task: str, cfg: EvaluateConfig, env_cfg: ManagerBasedRlEnvCfg, keep_num_envs: bool
+) -> int:
+    """Return the number of environments: the one set by --env.scene.num-envs, else one per episode."""
+    usual = policy_env_cfg(task, cfg.profile, purpose="evaluate").scene.num_envs
+    chosen = env_cfg.scene.num_envs
+    return chosen if keep_num_envs or chosen != usual else cfg.num_episodes
+
+
+def _table(figures: dict[str, Any]) -> str:
+    lines = [
+        f"Task         {figures['task']}",
+        f"Policy       {figures['policy']}",
+        f"Physics      {figures['physics']}",
+        f"Episodes     {figures['num_episodes']} in {figures['num_envs']} environments, "
+        f"mean length {figures['mean_length']:.1f} steps",
+        f"Mean return  {figures['mean_return']:.2f}   {_interval(figures['return_interval'], '.2f')}"
+        f"   range [{figures['min_return']:.2f}, {figures['max_return']:.2f}]",
+        "             (sum over the episode of the weighted reward before scaling by the time step)",
+    ]
+    if figures["success_rate"] is not None:
+        lines.append(
+            f"Success      {figures['success_rate']:.1%}   "
+            f"{_interval(figures['success_interval'], '.1%')}   ({figures['success_definition']})"
+        )
+    if figures["failure_rate"] is not None:
+        ended = [f"{name} {rate:.1%}" for name, rate in figures["terminations"].items() if rate]
+        lines.append(
+            f"Failures     {figures['failure_rate']:.1%}   "
+            f"{_interval(figures['failure_interval'], '.1%')}   "
+            f"(ended by: {', '.join(ended) or 'nothing'})"
+        )
+    for name, value in figures["metrics"].items():
+        lines.append(f"{name:<12} {value['mean']:.4g}   {_interval(value['interval'], '.4g')}")
+    lines += [f"Note         {note}" for note in figures["notes"]]
+    return "\n".join(lines)
+
+
+def _interval(bounds: Sequence[float] | None, form: str) -> str:
+    if bounds is None:
+        return "no interval"
+    low, high = bounds
+    return f"95 % interval [{low:{form}}, {high:{form}}]"
 
 
 def main() -> None:
     """Entry point of `evaluate`."""
-    run_command(_command)
+    run_alias("evaluate")
 
 
 if __name__ == "__main__":

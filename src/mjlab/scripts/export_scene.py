@@ -2,50 +2,185 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from mjlab.scripts.cli import first_and_flags, parse_flags, run_command
+from mjlab.scripts.cli import run_alias
+from mjlab.scripts.flags import parse_flags
+from mjlab.utils.errors import UserError
 
 if TYPE_CHECKING:
-    from mjlab.scripts.export_scene_run import ExportSceneConfig as ExportSceneConfig
+    from mjlab.entity import EntityCfg
+    from mjlab.scene import Scene, SceneCfg
+    from mjlab.sim import MujocoCfg
+ROBOTS = {"g1": "get_g1_robot_cfg", "go1": "get_go1_robot_cfg", "yam": "get_yam_robot_cfg"}
+"""Short names of robots, and the functions of `mjlab.asset_zoo.robots` that configure them."""
 
-_USAGE = """\
-usage: export-scene TARGET [flags]
-
-Write scene.xml and the files it refers to, for MuJoCo's own viewer and other programs.
-
-TARGET is the name of a task (`list-envs`), a robot (g1, go1, yam), or module:function, a function
-that returns an EntityCfg.
-
-examples:
-    uv run export-scene Mjlab-Velocity-Flat-Unitree-Go1 --output-dir go1_flat
-    uv run export-scene g1 --zip
-
-flags:
-    --output-dir DIR    folder to write into, which must be new or empty (default: export)
-    --zip               write the archive DIR.zip instead of a folder
-    --overwrite         replace an earlier export there; other files are left alone"""
+_XML, _ASSETS = "scene.xml", "assets"
 
 
-def __getattr__(name: str) -> Any:
-    if name in ("ExportSceneConfig", "run_export_scene"):
-        from mjlab.scripts import export_scene_run
+@dataclass(frozen=True)
+class ExportSceneConfig:
+    """Flags of `export-scene`."""
 
-        return getattr(export_scene_run, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    output_dir: str = "export"
+    """Folder to write into; it must be new or empty."""
+    zip: bool = False
+    """Write the archive `<output_dir>.zip` instead of a folder."""
+    overwrite: bool = False
+    """Replace an earlier export at that place; other files are left alone."""
 
 
-def _command(argv: list[str]) -> None:
-    target, flags = first_and_flags(argv, _USAGE, "target", argv)
-    from mjlab.scripts.export_scene_run import ExportSceneConfig, run_export_scene
-
-    cfg = parse_flags(ExportSceneConfig, ExportSceneConfig(), flags, "export-scene TARGET")
+def command(argv: list[str], prog: str) -> None:
+    """Run `export-scene`."""
+    target, *flags = argv
+    cfg = parse_flags(ExportSceneConfig, ExportSceneConfig(), flags, f"{prog} TARGET")
     run_export_scene(target, cfg)
+
+
+def run_export_scene(target: str, cfg: ExportSceneConfig) -> Path:
+    """Write the scene of `target` and return the folder or archive.
+
+    The physics options (time step, solver, cone, ...) with which an environment would simulate it
+    are in the file.
+
+    Raises:
+        UserError: an unknown target, or a place that is taken.
+    """
+    scene_cfg, options = _load(target)
+    folder = _folder(cfg)
+    result = folder.with_name(folder.name + ".zip") if cfg.zip else folder
+    _check_place(result, cfg)
+    scene = _build(scene_cfg, options)
+    if cfg.zip:
+        scene.write(folder, zip=True)
+    else:
+        _write_folder(scene, folder)
+    print(f"Wrote {result if cfg.zip else folder / _XML}.")
+    return result
+
+
+def _load(target: str) -> tuple[SceneCfg, MujocoCfg]:
+    """Return the scene and physics options of a task, a robot's short name or `module:function`."""
+    from mjlab.scene import SceneCfg
+    from mjlab.sim import MujocoCfg
+
+    if ":" in target:
+        return SceneCfg(entities={"robot": _from_function(target)}), MujocoCfg()
+    if target in ROBOTS:
+        from mjlab.asset_zoo import robots
+
+        make: Callable[[], EntityCfg] = getattr(robots, ROBOTS[target])
+        return SceneCfg(entities={"robot": make()}), MujocoCfg()
+    from mjlab.tasks.registry import UnknownTaskError, load_env_cfg
+
+    try:
+        env_cfg = load_env_cfg(target)
+    except UnknownTaskError as error:
+        raise UserError(
+            f"{error} The target may also be a robot ({', '.join(ROBOTS)}) or module:function."
+        ) from None
+    return env_cfg.scene, env_cfg.sim.mujoco
+
+
+def _needs_arguments(make: Callable[..., Any]) -> bool:
+    try:
+        inspect.signature(make).bind()
+    except TypeError:
+        return True
+    except ValueError:
+        # Functions of other languages may not tell.
+        return False
+    return False
+
+
+def _from_function(target: str) -> EntityCfg:
+    from mjlab.entity import EntityCfg
+
+    module_name, _, name = target.partition(":")
+    if os.getcwd() not in sys.path:
+        # As `python -m` does, so that a file in this folder is found.
+        sys.path.append(os.getcwd())
+    try:
+        make = getattr(importlib.import_module(module_name), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UserError(f"{target!r} cannot be imported: {error}.") from error
+    if callable(make) and _needs_arguments(make):
+        raise UserError(
+            f"{target!r} takes arguments, and export-scene takes functions that return an EntityCfg "
+            "without any."
+        )
+    made = make() if callable(make) else make
+    if not isinstance(made, EntityCfg):
+        raise UserError(
+            f"{target!r} made a {type(made).__name__}, and export-scene takes functions that "
+            "return an EntityCfg."
+        )
+    return made
+
+
+def _build(scene_cfg: SceneCfg, options: MujocoCfg) -> Scene:
+    from mjlab.scene import Scene
+
+    scene = Scene(scene_cfg, "cpu")
+    target: Any = SimpleNamespace(opt=scene.spec.option)
+    scene.report_overruled_options(options)
+    options.apply(target)
+    return scene
+
+
+def _folder(cfg: ExportSceneConfig) -> Path:
+    folder = Path(cfg.output_dir)
+    if not cfg.zip:
+        return folder
+    if folder.suffix == ".zip":
+        return folder.with_suffix("")
+    # An archive needs a name, which these paths do not say: `.`, `..`, `/`.
+    if folder.name in ("", ".."):
+        folder = folder.resolve()
+    if not folder.name:
+        raise UserError(f"--output-dir {cfg.output_dir} has no name that an archive could have.")
+    return folder
+
+
+def _check_place(result: Path, cfg: ExportSceneConfig) -> None:
+    if not cfg.zip and result.exists() and not result.is_dir():
+        raise UserError(f"{result} is a file. Choose another --output-dir.")
+    if cfg.overwrite or not result.exists():
+        return
+    if result.is_dir() and not any(result.iterdir()):
+        return
+    what = f"The archive {result} exists" if cfg.zip else f"The folder {result} is not empty"
+    raise UserError(
+        f"{what}. Choose another --output-dir, or give --overwrite True to replace an earlier "
+        "export there."
+    )
+
+
+def _write_folder(scene: Scene, folder: Path) -> None:
+    """Write beside the folder first, so that it never holds half an export."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".export-") as temporary:
+        made = Path(temporary) / "scene"
+        scene.write(made)
+        if (folder / _ASSETS).exists():
+            (folder / _ASSETS).rename(Path(temporary) / "earlier")
+        for name in (_ASSETS, _XML):
+            if (made / name).exists():
+                (made / name).replace(folder / name)
 
 
 def main() -> None:
     """Entry point of `export-scene`."""
-    run_command(_command)
+    run_alias("export-scene")
 
 
 if __name__ == "__main__":

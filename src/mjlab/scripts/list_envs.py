@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from mjlab.scripts.cli import run_command
+from mjlab.scripts.cli import run_alias
 
 
 def list_environments(keyword: str | None = None) -> list[str]:
@@ -16,9 +16,10 @@ def list_environments(keyword: str | None = None) -> list[str]:
     return [name for name in list_tasks() if wanted in name.lower()]
 
 
-def _command(argv: list[str]) -> None:
+def command(argv: list[str], prog: str) -> None:
+    """Run `list-envs`: exits 0, or 1 if nothing matches."""
     parser = argparse.ArgumentParser(
-        prog="list-envs", description="List the registered tasks, and their profiles."
+        prog=prog, description="List the registered tasks and their profiles."
     )
     parser.add_argument("--keyword", help="show only tasks whose name contains this")
     args = parser.parse_args(argv)
@@ -36,8 +37,8 @@ def _command(argv: list[str]) -> None:
 
 
 def main() -> None:
-    """Entry point of `list-envs` and `list_envs`: exits 0, or 1 if nothing matches."""
-    run_command(_command)
+    """Entry point of `list-envs`."""
+    run_alias("list-envs")
 
 
 if __name__ == "__main__":

@@ -2,46 +2,190 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 from mjlab.compat import older_names
-from mjlab.scripts.cli import run_command, task_and_flags, task_usage
+from mjlab.scripts.cli import run_alias
+from mjlab.scripts.devices import resolve_device
+from mjlab.scripts.environments import make_env
+from mjlab.scripts.policy import (
+    PolicyFlags,
+    env_cfg_of,
+    find_checkpoint,
+    load_policy,
+    make_policy,
+    parse_policy_flags,
+)
+from mjlab.scripts.run_folder import is_run_folder
+from mjlab.utils.errors import UserError
+from mjlab.viewer.page_server import check_address
 
 if TYPE_CHECKING:
-    from mjlab.scripts.play_run import PlayConfig as PlayConfig
-
-_USAGE = task_usage(
-    "play",
-    "Show a trained policy (the newest, unless one is named) in the browser, in MuJoCo's window, "
-    "or as a video.",
-    [
-        "play Mjlab-Cartpole-Swingup",
-        "play Mjlab-Cartpole-Swingup --checkpoint-file logs/rsl_rl/cartpole/model_500.pt",
-        "play Mjlab-Cartpole-Swingup --agent random --viewer native",
-        "play Mjlab-Cartpole-Swingup --viewer none --num-steps 200 --video True",
-    ],
-)
+    from mjlab.envs import ManagerBasedRlEnvCfg
+__getattr__ = older_names(__name__)
 
 
-def __getattr__(name: str) -> Any:
-    if name in ("PlayConfig", "run_play"):
-        from mjlab.scripts import play_run
+@dataclass
+class PlayConfig(PolicyFlags):
+    """Flags of `play`."""
 
-        return getattr(play_run, name)
-    return older_names(__name__)(name)
+    num_envs: int | None = None
+    """Number of environments; None keeps the task's."""
+    video: bool = False
+    """Record a clip instead of opening a viewer."""
+    video_length: int = 200
+    """Frames of the clip."""
+    video_format: Literal["mp4", "gif"] = "mp4"
+    """Format of the clip."""
+    video_height: int | None = None
+    """Height of the clip, in pixels."""
+    video_width: int | None = None
+    """Width of the clip, in pixels."""
+    camera: int | str | None = None
+    """Camera of the model to record from, by name or index; None is the task's own view."""
+    viewer: Literal["auto", "native", "viser", "none"] = "auto"
+    """`viser` is a page in the browser, `native` is MuJoCo's window, `none` steps without looking.
+    `auto` takes the window where there is a display, else the page."""
+    num_steps: int | None = None
+    """Environment steps to take; None plays until stopped."""
+    host: str = "127.0.0.1"
+    """Address that the page is served on; 0.0.0.0 serves the whole network."""
+    port: int = 8080
+    """Port that the page is served on."""
+    open_browser: bool = False
+    """Open the page in this machine's browser, if there is a display."""
+    no_terminations: bool = False
+    """Switch off every termination, the time limit included."""
 
 
-def _command(argv: list[str]) -> None:
-    task, flags = task_and_flags(argv, _USAGE)
-    from mjlab.scripts.play_run import PlayConfig, run_play
-    from mjlab.scripts.policy import parse_policy_flags
+def command(argv: list[str], prog: str) -> None:
+    """Run `play`."""
+    task, *flags = argv
+    run_play(task, parse_policy_flags(PlayConfig, flags, task, prog, purpose="play"))
 
-    run_play(task, parse_policy_flags(PlayConfig, flags, task, "play", purpose="play"))
+
+def run_play(task: str, cfg: PlayConfig) -> None:
+    """Play `task` as `cfg` says.
+
+    Raises:
+        UserError, ValueError, OSError, CheckpointError, EngineUnavailableError,
+        RenderingUnavailableError: what was asked for cannot be done.
+    """
+    if cfg.num_steps is not None and cfg.num_steps < 1:
+        raise UserError(f"--num-steps is {cfg.num_steps}; it has to be at least 1.")
+    if cfg.viewer == "none" and cfg.num_steps is None and not cfg.video:
+        raise UserError("--viewer none needs --num-steps, because nothing else would end it.")
+    if cfg.video_length < 1:
+        raise UserError(f"--video-length is {cfg.video_length}; it has to be at least 1.")
+    check_address(cfg.host, cfg.port, "--")
+    device = resolve_device(cfg.device)
+    checkpoint = find_checkpoint(task, cfg)
+    env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="play")
+    if cfg.no_terminations:
+        env_cfg.terminations = {}
+    if cfg.video:
+        _record(task, cfg, env_cfg, checkpoint, device)
+        return
+    from mjlab.utils.torch import threads_for_policy
+
+    env = make_env(task, env_cfg, device, cfg.num_envs, cfg.engine, profile=cfg.profile)
+    print(f"Physics:    {env.unwrapped.sim.capabilities.description}")
+    try:
+        policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
+        with threads_for_policy(policy, env.num_envs, device):
+            if cfg.viewer == "none" and cfg.num_steps is not None:
+                _play_headless(env, policy, cfg.num_steps)
+            else:
+                viewer = _make_viewer(task, cfg, env, policy, checkpoint, device)
+                viewer.run(num_steps=cfg.num_steps)
+    finally:
+        env.close()
+
+
+def _play_headless(env: Any, policy: Any, num_steps: int) -> None:
+    from mjlab.viewer.base import run_headless
+
+    result = run_headless(env, policy, num_steps)
+    print(
+        f"{result.num_steps} steps in {env.num_envs} environments, {result.num_episodes} episodes "
+        f"ended, mean reward per step {result.mean_step_reward:.4f}"
+    )
+
+
+def _make_viewer(
+    task: str, cfg: PlayConfig, env: Any, policy: Any, checkpoint: Path | None, device: str
+) -> Any:
+    if cfg.viewer == "native" or (cfg.viewer == "auto" and _has_display()):
+        from mjlab.viewer import NativeMujocoViewer
+
+        return NativeMujocoViewer(env, policy)
+    from mjlab.viewer import ViserPlayViewer
+    from mjlab.viewer.viser.viewer import local_checkpoints
+
+    manager = None
+    if checkpoint is not None and any(checkpoint.parent.glob("*.pt")):
+        manager = local_checkpoints(
+            checkpoint.parent,
+            lambda path: load_policy(task, env, path, device, cfg.profile),
+            current=checkpoint.name,
+        )
+    viewer = ViserPlayViewer(env, policy, checkpoint_manager=manager, host=cfg.host, port=cfg.port)
+    print(f"Open {viewer.url} in a browser. Ctrl-C ends.", flush=True)
+    if cfg.open_browser and _can_open_browser():
+        import webbrowser
+
+        webbrowser.open(viewer.url)
+    return viewer
+
+
+def _has_display() -> bool:
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _can_open_browser() -> bool:
+    # Without a display, Linux would open a browser for the terminal, in this terminal.
+    return sys.platform in ("darwin", "win32") or _has_display()
+
+
+def _record(
+    task: str,
+    cfg: PlayConfig,
+    env_cfg: ManagerBasedRlEnvCfg,
+    checkpoint: Path | None,
+    device: str,
+) -> None:
+    from mjlab.scripts.policy import VideoCfg, record_policy
+
+    folder = Path("videos")
+    if checkpoint is not None and is_run_folder(checkpoint.parent):
+        folder = checkpoint.parent / "videos" / "play"
+    record_policy(
+        task,
+        env_cfg,
+        checkpoint,
+        folder,
+        device,
+        VideoCfg(
+            length=cfg.num_steps or cfg.video_length,
+            suffix=cfg.video_format,
+            height=cfg.video_height,
+            width=cfg.video_width,
+            camera=cfg.camera,
+            num_envs=cfg.num_envs,
+            engine=cfg.engine,
+            agent=cfg.agent,
+            profile=cfg.profile,
+        ),
+    )
 
 
 def main() -> None:
     """Entry point of `play`."""
-    run_command(_command)
+    run_alias("play")
 
 
 if __name__ == "__main__":

@@ -3,63 +3,34 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from types import UnionType
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from mjlab.envs import ManagerBasedRlEnvCfg
-from mjlab.rl.config import RslRlBaseRunnerCfg, RslRlDistillationRunnerCfg
+from mjlab.rl.config import RslRlBaseRunnerCfg, RslRlDistillationRunnerCfg, RslRlModelCfg
 from mjlab.rl.learners import Learner, acting_cfg
-from mjlab.scripts.cli import BadCallError, UserError, is_given, tell
-from mjlab.scripts.profiles import parse_with_choices, profile_of_run
+from mjlab.scripts.environments import make_env
+from mjlab.scripts.flags import (
+    is_given,
+    parse_with_choices,
+    prepare_env_cfg,
+    profile_of_run,
+    with_task_options,
+)
 from mjlab.scripts.run_folder import (
-    named_checkpoint,
     newest_checkpoint,
     read_agent_params,
     read_run_info,
+    resolve_checkpoint,
 )
-from mjlab.scripts.task_options import prepare_env_cfg, with_task_options
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
-
-# The classes of networks that a run's own settings may name. No others come from a file, because
-# rsl_rl would import and call whatever they name.
-_CLASSES = (
-    "MLPModel",
-    "CNNModel",
-    "RNNModel",
-    "mjlab.rl.sac_models:SacActorModel",
-    "mjlab.rl.sac_models:TwinCriticModel",
-    "mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel",
-    "mjlab.tasks.tracking.rl.reference_actor:ReferenceActor",
-)
-
-# What a run's own settings may change about the task's networks.
-_SETTINGS: dict[str, Callable[[Any], bool]] = {
-    "class_name": lambda value: value in _CLASSES,
-    "hidden_dims": lambda value: isinstance(value, list) and all(_is_count(v) for v in value),
-    "activation": lambda value: isinstance(value, str) and value.isidentifier(),
-    "obs_normalization": lambda value: isinstance(value, bool),
-    "cnn_cfg": lambda value: value is None or (isinstance(value, dict) and _is_encoder(value)),
-    "rnn_type": lambda value: value in (None, "lstm", "gru"),
-    "rnn_hidden_dim": lambda value: _is_count(value),
-    "rnn_num_layers": lambda value: _is_count(value),
-}
-
-
-def _is_count(value: Any) -> bool:
-    return type(value) is int and value > 0
-
-
-def _is_encoder(value: Any) -> bool:
-    """Return whether `value` is made of numbers and single words, as settings of an encoder are."""
-    if isinstance(value, dict):
-        return all(isinstance(k, str) and _is_encoder(v) for k, v in value.items())
-    if isinstance(value, list):
-        return all(_is_encoder(item) for item in value)
-    return isinstance(value, (bool, int, float)) or (
-        isinstance(value, str) and value.isidentifier()
-    )
+from mjlab.utils.errors import BadCallError, UserError
+from mjlab.utils.logging import print_notice
+from mjlab.viewer.base import ended, forget
 
 
 @dataclass
@@ -89,6 +60,8 @@ class PolicyFlags:
 
 
 F = TypeVar("F", bound=PolicyFlags)
+
+
 Purpose = Literal["play", "evaluate", "train"]
 
 
@@ -128,126 +101,7 @@ def parse_policy_flags(
     return cfg
 
 
-def make_policy(
-    task: str,
-    env: Any,
-    agent: str,
-    checkpoint: Path | None,
-    device: str,
-    profile: str | None = None,
-) -> Any:
-    """Return the policy in `checkpoint`, or where there is none the constant one of `agent`.
-
-    Raises:
-        CheckpointError: see `load_policy`.
-    """
-    if checkpoint is None:
-        return constant_policy(env, agent)
-    return load_policy(task, env, checkpoint, device, profile)
-
-
-def load_policy(
-    task: str, env: Any, checkpoint: Path, device: str, profile: str | None = None
-) -> Any:
-    """Return the deterministic policy in `checkpoint`, for the wrapped environment `env`.
-
-    Args:
-        task: Name of the task.
-        env: The wrapped environment.
-        checkpoint: A checkpoint, or an exported policy (`.onnx`).
-        device: Torch device of the policy.
-        profile: Profile of the task that it was trained with.
-
-    Raises:
-        CheckpointError: the file is missing, damaged, or holds another network.
-    """
-    if checkpoint.suffix == ".onnx":
-        from mjlab.rl.onnx_policy import load_onnx_policy
-
-        return load_onnx_policy(checkpoint, env, device)
-    from mjlab.rl import MjlabOnPolicyRunner
-    from mjlab.rl.checkpoint import learner_of_checkpoint
-
-    learner = learner_of_checkpoint(checkpoint)
-    agent_cfg = _agent_cfg(task, checkpoint, profile, learner)
-    runner_cls: Any = load_runner_cls(task) or MjlabOnPolicyRunner
-    runner = runner_cls(env, agent_cfg, None, device)
-    network = "student" if learner == "distillation" else "actor"
-    runner.load(str(checkpoint), load_cfg={network: True}, strict=True, map_location=device)
-    return runner.get_inference_policy(device=device)
-
-
-def _agent_cfg(
-    task: str, checkpoint: Path, profile: str | None = None, learner: Learner | None = None
-) -> dict[str, Any]:
-    """Return the learner's config of `task`, with the networks that the checkpoint's run had.
-
-    The command line may have given them other sizes and classes than the task and its profile do.
-    """
-    cfg = acting_cfg(load_rl_cfg(task, profile=profile, learner=learner))
-    saved = read_agent_params(checkpoint.parent)
-    for network in ("actor", "critic", "student", "teacher"):
-        if network in cfg:
-            cfg[network] |= _saved_settings(saved, network, cfg[network])
-    return cfg
-
-
-def _saved_settings(
-    saved: Mapping[str, Any], network: str, known: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Return what a run's own settings say of a network, as far as it is `known` and valid."""
-    settings = saved.get(network)
-    if not isinstance(settings, dict):
-        return {}
-    return {
-        name: settings[name]
-        for name, is_valid in _SETTINGS.items()
-        if name in settings and name in known and is_valid(settings[name])
-    }
-
-
-def prepare_teacher(task: str, cfg: RslRlBaseRunnerCfg, resumed: Path | None) -> None:
-    """Settle checkpoint and network of a distillation's teacher, in place; else do nothing.
-
-    The network is that of the teacher's run. A `resumed` run has its teacher already.
-
-    Raises:
-        UserError: there is no such checkpoint, or it is not one of PPO and of this task; or the
-            resumed run has another teacher.
-        CheckpointError: the checkpoint is damaged.
-    """
-    if not isinstance(cfg, RslRlDistillationRunnerCfg):
-        return
-    flag, given = "--agent.teacher-checkpoint", cfg.teacher_checkpoint
-    if resumed is not None:
-        saved, network = read_agent_params(resumed.parent), "teacher"
-        recorded = saved.get("teacher_checkpoint")
-        if given is not None and given != recorded:
-            raise UserError(
-                f"{flag}: expected that of the resumed run, {recorded}, got {given}; leave it out."
-            )
-        cfg.teacher_checkpoint = recorded if isinstance(recorded, str) else None
-    elif given is not None:
-        path = named_checkpoint(Path(given), task)
-        _check_teacher(task, path, flag)
-        cfg.teacher_checkpoint = str(path)
-        saved, network = read_agent_params(path.parent), "actor"
-    else:
-        return
-    cfg.teacher = replace(cfg.teacher, **_saved_settings(saved, network, asdict(cfg.teacher)))
-
-
-def _check_teacher(task: str, path: Path, flag: str) -> None:
-    from mjlab.rl.checkpoint import learner_of_checkpoint
-
-    learner = learner_of_checkpoint(path)
-    if learner != "ppo":
-        raise UserError(
-            f"{flag}: expected a checkpoint of the learner 'ppo', got {path}, which {learner!r} wrote."
-        )
-    trained = read_run_info(path.parent).get("task", task)
-    if trained != task:
-        raise UserError(f"{flag}: expected a checkpoint of {task}, got {path}, of {trained}.")
+# Finding the policy.
 
 
 def find_checkpoint(task: str, flags: PolicyFlags) -> Path | None:
@@ -261,7 +115,7 @@ def find_checkpoint(task: str, flags: PolicyFlags) -> Path | None:
     if flags.agent != "trained":
         return None
     if flags.checkpoint_file is not None:
-        path = named_checkpoint(Path(flags.checkpoint_file), task)
+        path = resolve_checkpoint(Path(flags.checkpoint_file), task)
     elif flags.wandb_run_path is not None:
         from mjlab.utils.os import get_wandb_checkpoint_path
 
@@ -285,7 +139,7 @@ def _newest_checkpoint(task: str, flags: PolicyFlags) -> Path:
             f"No checkpoint was named, and {experiment} has none of {task}{by}. Run `train "
             f"{task}{choice}` first, or give --checkpoint-file or --wandb-run-path."
         )
-    tell(f"Checkpoint: {path}")
+    print_notice(f"Checkpoint: {path}")
     return path
 
 
@@ -320,55 +174,14 @@ def profile_of_policy(task: str, flags: PolicyFlags) -> str | None:
         path = newest_checkpoint(_experiment(task, flags), task, flags.learner)
     else:
         try:
-            path = named_checkpoint(Path(flags.checkpoint_file), task)
+            path = resolve_checkpoint(Path(flags.checkpoint_file), task)
         except UserError:
             # It is told when the policy is looked for in earnest.
             return None
     return None if path is None else profile_of_run(task, path.parent)
 
 
-def constant_policy(env: Any, kind: str) -> Any:
-    """Return a policy that does not look: `zero` actions, or `random` ones in [-1, 1]."""
-    import torch
-
-    shape = (env.num_envs, env.num_actions)
-    if kind == "zero":
-        zeros = torch.zeros(shape, dtype=torch.float32, device=env.device)
-        return lambda observations: zeros
-    return lambda observations: (
-        2.0 * torch.rand(shape, dtype=torch.float32, device=env.device) - 1.0
-    )
-
-
-def make_env(
-    task: str,
-    cfg: ManagerBasedRlEnvCfg,
-    device: str,
-    num_envs: int | None = None,
-    engine: Any = None,
-    *,
-    seed: int | None = None,
-    render_mode: str | None = None,
-    profile: str | None = None,
-) -> Any:
-    """Return the wrapped environment of `cfg`; what is None is left as `cfg` has it.
-
-    Actions are clipped as the learner's config of the task says, under `profile`.
-    """
-    from mjlab.envs import ManagerBasedRlEnv
-    from mjlab.rl import RslRlVecEnvWrapper
-    from mjlab.utils.torch import prepare_torch
-
-    prepare_torch(device)
-    cfg = copy.deepcopy(cfg)
-    cfg.seed = cfg.seed if seed is None else seed
-    if num_envs is not None:
-        cfg.scene.num_envs = num_envs
-    if engine is not None:
-        cfg.sim.engine = engine
-    env = ManagerBasedRlEnv(cfg, device=device, render_mode=render_mode)
-    clip_actions = load_rl_cfg(task, profile=profile).clip_actions
-    return RslRlVecEnvWrapper(env, clip_actions=clip_actions)
+# Its environment.
 
 
 def env_cfg_of(
@@ -412,3 +225,261 @@ def policy_env_cfg(task: str, profile: str | None, *, purpose: Purpose) -> Manag
         if prepare is not None:
             prepare(cfg)
     return cfg
+
+
+# Loading it.
+
+
+def make_policy(
+    task: str,
+    env: Any,
+    agent: str,
+    checkpoint: Path | None,
+    device: str,
+    profile: str | None = None,
+) -> Any:
+    """Return the policy in `checkpoint`, or where there is none the constant one of `agent`.
+
+    Raises:
+        CheckpointError: see `load_policy`.
+    """
+    if checkpoint is None:
+        return constant_policy(env, agent)
+    return load_policy(task, env, checkpoint, device, profile)
+
+
+def load_policy(
+    task: str, env: Any, checkpoint: Path, device: str, profile: str | None = None
+) -> Any:
+    """Return the deterministic policy in `checkpoint`, for the wrapped environment `env`.
+
+    Args:
+        task: Name of the task.
+        env: The wrapped environment.
+        checkpoint: A checkpoint, or an exported policy (`.onnx`).
+        device: Torch device of the policy.
+        profile: Profile of the task that it was trained with.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, or holds another network.
+    """
+    if checkpoint.suffix == ".onnx":
+        from mjlab.rl.onnx_policy import load_onnx_policy
+
+        return load_onnx_policy(checkpoint, env, device)
+    from mjlab.rl import MjlabOnPolicyRunner
+    from mjlab.rl.checkpoint import CheckpointError, learner_of_checkpoint
+
+    learner = learner_of_checkpoint(checkpoint)
+    agent_cfg = _agent_cfg(task, checkpoint, profile, learner)
+    runner_cls: Any = load_runner_cls(task) or MjlabOnPolicyRunner
+    try:
+        runner = runner_cls(env, agent_cfg, None, device)
+    except (RuntimeError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"The networks of {checkpoint} cannot be built as params/agent.yaml beside it says: {error}"
+        ) from error
+    network = "student" if learner == "distillation" else "actor"
+    runner.load(str(checkpoint), load_cfg={network: True}, strict=True, map_location=device)
+    return runner.get_inference_policy(device=device)
+
+
+def constant_policy(env: Any, kind: str) -> Any:
+    """Return a policy that does not look: `zero` actions, or `random` ones in [-1, 1]."""
+    import torch
+
+    shape = (env.num_envs, env.num_actions)
+    if kind == "zero":
+        zeros = torch.zeros(shape, dtype=torch.float32, device=env.device)
+        return lambda observations: zeros
+    return lambda observations: (
+        2.0 * torch.rand(shape, dtype=torch.float32, device=env.device) - 1.0
+    )
+
+
+def _agent_cfg(
+    task: str, checkpoint: Path, profile: str | None = None, learner: Learner | None = None
+) -> dict[str, Any]:
+    """Return the learner's config of `task`, with the networks that the checkpoint's run had.
+
+    The command line may have given them other sizes and classes than the task and its profile do.
+    """
+    rl_cfg = load_rl_cfg(task, profile=profile, learner=learner)
+    cfg = acting_cfg(rl_cfg)
+    saved = read_agent_params(checkpoint.parent)
+    for network in ("actor", "critic", "student", "teacher"):
+        if network in cfg:
+            cfg[network] |= _saved_settings(saved, network, getattr(rl_cfg, network))
+    return cfg
+
+
+def _saved_settings(saved: Mapping[str, Any], network: str, model: RslRlModelCfg) -> dict[str, Any]:
+    """Return the settings of a run's network that have the types of the fields of `model`.
+
+    rsl_rl imports and calls what a setting like "module:function" names, and a run may come from
+    a stranger: only class names of networks of this package and of the task itself are taken.
+    """
+    settings = saved.get(network)
+    if not isinstance(settings, dict):
+        return {}
+    types = get_type_hints(type(model))
+    return {
+        name: value
+        for name, value in settings.items()
+        if name in types
+        and _has_type(value, types[name])
+        and (_names_nothing_to_import(value) or (name == "class_name" and _is_own(value, model)))
+    }
+
+
+def _has_type(value: Any, declared: Any) -> bool:
+    """Return whether `value`, read from YAML, is of the `declared` type; tuples are lists there."""
+    origin, arguments = get_origin(declared), get_args(declared)
+    if origin is UnionType:
+        return any(_has_type(value, option) for option in arguments)
+    if origin is tuple:
+        return isinstance(value, list) and all(_has_type(item, arguments[0]) for item in value)
+    return type(value) is (origin or declared)
+
+
+def _names_nothing_to_import(value: Any) -> bool:
+    if isinstance(value, dict):
+        return all(_names_nothing_to_import(item) for item in (*value, *value.values()))
+    if isinstance(value, list):
+        return all(_names_nothing_to_import(item) for item in value)
+    return not isinstance(value, str) or value.isidentifier()
+
+
+def _is_own(class_name: str, model: RslRlModelCfg) -> bool:
+    """Return whether `class_name` is that of `model`, or of a network of this package."""
+    if class_name == model.class_name:
+        return True
+    module, _, name = class_name.partition(":")
+    if not module.startswith("mjlab."):
+        return False
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except ImportError:
+        return False
+    from torch import nn
+
+    return isinstance(found, type) and issubclass(found, nn.Module)
+
+
+def prepare_teacher(task: str, cfg: RslRlBaseRunnerCfg, resumed: Path | None) -> None:
+    """Settle checkpoint and network of a distillation's teacher, in place; else do nothing.
+
+    The network is that of the teacher's run. A `resumed` run has its teacher already.
+
+    Raises:
+        UserError: there is no such checkpoint, or it is not one of PPO and of this task; or the
+            resumed run has another teacher.
+        CheckpointError: the checkpoint is damaged.
+    """
+    if not isinstance(cfg, RslRlDistillationRunnerCfg):
+        return
+    flag, given = "--agent.teacher-checkpoint", cfg.teacher_checkpoint
+    if resumed is not None:
+        saved, network = read_agent_params(resumed.parent), "teacher"
+        recorded = saved.get("teacher_checkpoint")
+        if given is not None and given != recorded:
+            raise UserError(
+                f"{flag}: expected that of the resumed run, {recorded}, got {given}; leave it out."
+            )
+        cfg.teacher_checkpoint = recorded if isinstance(recorded, str) else None
+    elif given is not None:
+        path = resolve_checkpoint(Path(given), task)
+        _check_teacher(task, path, flag)
+        cfg.teacher_checkpoint = str(path)
+        saved, network = read_agent_params(path.parent), "actor"
+    else:
+        return
+    cfg.teacher = replace(cfg.teacher, **_saved_settings(saved, network, cfg.teacher))
+
+
+def _check_teacher(task: str, path: Path, flag: str) -> None:
+    from mjlab.rl.checkpoint import learner_of_checkpoint
+
+    learner = learner_of_checkpoint(path)
+    if learner != "ppo":
+        raise UserError(
+            f"{flag}: expected a checkpoint of the learner 'ppo', got {path}, which {learner!r} wrote."
+        )
+    trained = read_run_info(path.parent).get("task", task)
+    if trained != task:
+        raise UserError(f"{flag}: expected a checkpoint of {task}, got {path}, of {trained}.")
+
+
+# Recording it.
+
+
+@dataclass(frozen=True)
+class VideoCfg:
+    """What a recording looks like."""
+
+    length: int = 200
+    """Frames, one an environment step."""
+    height: int | None = None
+    """Height in pixels; None keeps the task's."""
+    width: int | None = None
+    """Width in pixels; None keeps the task's."""
+    suffix: Literal["mp4", "gif"] = "mp4"
+    """Format of the file."""
+    camera: int | str | None = None
+    """Camera of the model, by name or index; None is the task's own view."""
+    num_envs: int | None = None
+    """Number of environments; None keeps the task's."""
+    engine: Any = None
+    """Physics engine; None keeps the task's."""
+    agent: str = "trained"
+    """Who acts where there is no checkpoint: `zero` or `random`."""
+    profile: str | None = None
+    """Profile of the task that the policy was trained with."""
+
+
+def record_policy(
+    task: str,
+    env_cfg: ManagerBasedRlEnvCfg,
+    checkpoint: Path | None,
+    folder: Path,
+    device: str,
+    video: VideoCfg | None = None,
+) -> Path | None:
+    """Record one clip into `folder` and return its path.
+
+    Raises:
+        RenderingUnavailableError: this machine cannot render; the message says what to install.
+    """
+    import torch
+
+    from mjlab.utils.wrappers.video_recorder import ClipWriter
+
+    video = video or VideoCfg()
+
+    env_cfg = copy.deepcopy(env_cfg)
+    env_cfg.viewer.height = video.height or env_cfg.viewer.height
+    env_cfg.viewer.width = video.width or env_cfg.viewer.width
+    env = make_env(
+        task,
+        env_cfg,
+        device,
+        video.num_envs,
+        video.engine,
+        render_mode="rgb_array",
+        profile=video.profile,
+    )
+    try:
+        policy = make_policy(task, env, video.agent, checkpoint, device, video.profile)
+        name = video.agent if checkpoint is None else checkpoint.stem
+        writer = ClipWriter(
+            folder / f"{task}-{name}.{video.suffix}", env.unwrapped.metadata["render_fps"]
+        )
+        with torch.inference_mode():
+            for _ in range(video.length):
+                forget(policy, ended(env.step(policy(env.get_observations()))))
+                writer.add(env.unwrapped.render(video.camera))
+        path = writer.close()
+    finally:
+        env.close()
+    print(f"Video: {path}")
+    return path

@@ -2,44 +2,427 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import contextlib
+import json
+import time
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
 
-from mjlab.scripts.cli import run_command, task_and_flags, task_usage
+import torch
+
+from mjlab.managers.manager_base import NullManager
+from mjlab.scripts.cli import run_alias
+from mjlab.scripts.devices import resolve_device
+from mjlab.scripts.environments import make_env
+from mjlab.scripts.policy import (
+    PolicyFlags,
+    env_cfg_of,
+    find_checkpoint,
+    make_policy,
+    parse_policy_flags,
+)
+from mjlab.utils.errors import UserError
 
 if TYPE_CHECKING:
-    from mjlab.scripts.profile_env_run import ProfileConfig as ProfileConfig
+    from mjlab.envs.manager_based_rl_env import ManagerBasedRlEnv
+# Methods of the simulation and the scene that a step calls, and the phase that each belongs to.
+_SIMULATION = {
+    "step": "physics",
+    "forward": "forward",
+    "forward_after_reset": "forward",
+    "sense": "sense",
+    "reset": "reset",
+}
+_SCENE = {"write_data_to_sim": "actuators", "update": "sensors", "reset": "reset"}
+# Methods of each manager that a step calls; the phase is named after the manager.
+_MANAGERS = {
+    "actions": ("action_manager", ("process_action", "apply_action", "reset")),
+    "terminations": ("termination_manager", ("compute", "reset")),
+    "rewards": ("reward_manager", ("compute", "reset")),
+    "metrics": ("metrics_manager", ("compute", "compute_substep", "reset")),
+    "events": ("event_manager", ("apply", "reset")),
+    "curriculum": ("curriculum_manager", ("compute", "reset")),
+    "commands": ("command_manager", ("compute", "reset")),
+    "observations": ("observation_manager", ("compute", "preview", "reset")),
+    "recorders": (
+        "recorder_manager",
+        ("record_pre_reset", "record_post_reset", "record_post_step"),
+    ),
+}
+# Methods of terms that are objects, by manager.
+_TERM_METHODS = {
+    "actions": ("process_actions", "apply_actions", "reset"),
+    "commands": ("compute", "reset"),
+    "recorders": ("record_pre_reset", "record_post_reset", "record_post_step"),
+}
 
-_USAGE = task_usage(
-    "profile-env",
-    "Step a task with random actions, and print the time of a step by phase (physics, forward, each "
-    "manager) and by term.",
-    [
-        "profile-env Mjlab-Cartpole-Swingup",
-        "profile-env Mjlab-Cartpole-Swingup --num-envs 4096 --steps 200 --json",
-    ],
-)
+
+# A term that takes more than this part of a step is worth a look.
+_MUCH = 5.0
 
 
-def __getattr__(name: str) -> Any:
-    if name in ("ProfileConfig", "run_profile_env"):
-        from mjlab.scripts import profile_env_run
+@dataclass
+class ProfileConfig(PolicyFlags):
+    """Flags of `profile-env`."""
 
-        return getattr(profile_env_run, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    agent: Literal["zero", "random", "trained"] = "random"
+    """Who acts: all-zero actions, uniform ones in [-1, 1], or a trained policy."""
+    num_envs: int = 1024
+    """Number of environments."""
+    steps: int = 100
+    """Environment steps to time."""
+    warm_up: int = 20
+    """Environment steps before that."""
+    seed: int = 0
+    """Seed of states and actions."""
+    json: bool = False
+    """Print only JSON."""
 
 
-def _command(argv: list[str]) -> None:
-    task, flags = task_and_flags(argv, _USAGE)
-    from mjlab.scripts.policy import parse_policy_flags
-    from mjlab.scripts.profile_env_run import ProfileConfig, run_profile_env
-
-    cfg = parse_policy_flags(ProfileConfig, flags, task, "profile-env", purpose="train")
+def command(argv: list[str], prog: str) -> None:
+    """Run `profile-env`."""
+    task, *flags = argv
+    cfg = parse_policy_flags(ProfileConfig, flags, task, prog, purpose="train")
     run_profile_env(task, cfg)
+
+
+def run_profile_env(task: str, cfg: ProfileConfig) -> dict[str, Any]:
+    """Time the steps of `task`, print the figures, and return them.
+
+    The environment is that of the task's training config, at random points of its episodes, so
+    that resets come as often as they do while training.
+    """
+    import torch
+
+    from mjlab.utils.torch import threads_for_policy
+
+    for name, least in (("num_envs", 1), ("steps", 1), ("warm_up", 0)):
+        if (value := getattr(cfg, name)) < least:
+            flag = name.replace("_", "-")
+            raise UserError(f"--{flag} is {value}; it has to be at least {least}.")
+    device = resolve_device(cfg.device)
+    checkpoint = find_checkpoint(task, cfg)
+    env = make_env(
+        task,
+        env_cfg_of(task, cfg, checkpoint, purpose="train"),
+        device,
+        cfg.num_envs,
+        cfg.engine,
+        seed=cfg.seed,
+        profile=cfg.profile,
+    )
+    try:
+        policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
+        lengths = env.episode_length_buf
+        env.episode_length_buf = torch.randint_like(lengths, high=env.max_episode_length)
+        with torch.inference_mode(), threads_for_policy(policy, cfg.num_envs, device):
+            _step(env, policy, cfg.warm_up)
+            seconds = _step(env, policy, cfg.steps)
+            with profiled_steps(env.unwrapped) as profile:
+                _step(env, policy, cfg.steps)
+        physics = env.unwrapped.sim.capabilities.description
+    finally:
+        env.close()
+    figures = {
+        "task": task,
+        "num_envs": cfg.num_envs,
+        "physics": physics,
+        "steps": cfg.steps,
+        "step_ms": 1e3 * seconds / cfg.steps,
+        **profile_rows(profile),
+    }
+    print(json.dumps(figures, indent=2) if cfg.json else _text(figures))
+    return figures
+
+
+def _step(env: Any, policy: Any, count: int) -> float:
+    """Take `count` steps and return the seconds that stepping the environment took."""
+    seconds = 0.0
+    for _ in range(count):
+        actions = policy(env.get_observations())
+        _wait_for(env.device)
+        begin = time.perf_counter()
+        env.step(actions)
+        _wait_for(env.device)
+        seconds += time.perf_counter() - begin
+    return seconds
+
+
+def _wait_for(device: Any) -> None:
+    if device.type == "cuda":
+        import torch
+
+        torch.cuda.synchronize(device)
+
+
+def profile_rows(profile: StepProfile) -> dict[str, Any]:
+    """Return a profile as milliseconds of a step and percent of it, the largest first."""
+
+    def row(seconds: float, **names: str) -> dict[str, Any]:
+        return {**names, "ms": profile.milliseconds(seconds), "percent": profile.percent(seconds)}
+
+    def sorted_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        return sorted(rows, key=lambda row: -row["ms"])
+
+    phases = {**profile.phases, "other": profile.other}
+    return {
+        "profiled_step_ms": profile.milliseconds(profile.step_time),
+        "phases": sorted_rows([row(seconds, name=name) for name, seconds in phases.items()]),
+        "terms": sorted_rows(
+            [
+                row(seconds, manager=manager, name=name)
+                for manager, terms in profile.terms.items()
+                for name, seconds in terms.items()
+            ]
+        ),
+    }
+
+
+def _text(figures: dict[str, Any]) -> str:
+    step, profiled = figures["step_ms"], figures["profiled_step_ms"]
+    per_second = figures["num_envs"] / (step * 1e-3)
+    lines = [
+        f"Task     {figures['task']}, {figures['num_envs']} environments",
+        f"Physics  {figures['physics']}",
+        f"Step     {step:.3f} ms, {per_second:,.0f} environment steps per second; "
+        f"{profiled:.3f} ms while timed in parts, over {figures['steps']} steps",
+        "",
+        *_table(("phase",), [((row["name"],), row) for row in figures["phases"]]),
+        "",
+        *_table(
+            ("manager", "term"),
+            [((row["manager"], row["name"]), row) for row in figures["terms"]],
+        ),
+        "",
+        _note(figures["terms"]),
+    ]
+    return "\n".join(lines)
+
+
+def _table(
+    header: tuple[str, ...], rows: list[tuple[tuple[str, ...], dict[str, Any]]]
+) -> list[str]:
+    widths = [
+        max(len(names[column]) for names in (header, *(names for names, _ in rows)))
+        for column in range(len(header))
+    ]
+
+    def line(names: tuple[str, ...], ms: str, percent: str) -> str:
+        cells = [f"{name:<{width}}" for name, width in zip(names, widths, strict=True)]
+        return "  ".join([*cells, f"{ms:>9}", f"{percent:>6}"])
+
+    lines = [line(header, "ms", "%")]
+    return lines + [line(names, f"{row['ms']:.3f}", f"{row['percent']:.1f}") for names, row in rows]
+
+
+def _note(terms: list[dict[str, Any]]) -> str:
+    much = [row for row in terms if row["percent"] > _MUCH]
+    if not much:
+        return f"No term takes more than {_MUCH:g} % of the step."
+    names = (f"{row['manager']}/{row['name']} ({row['percent']:.1f} %)" for row in much)
+    return f"More than {_MUCH:g} % of the step: {', '.join(names)}."
+
+
+# Timing of the methods that a step calls.
+
+
+@dataclass
+class StepProfile:
+    """Seconds spent in environment steps, in sum over all steps.
+
+    What is done within a phase counts for that phase: a `forward` that a command asks for is time of
+    the commands. So phases add up to no more than the steps, and the terms of a manager to no more
+    than the manager. A sensor that computes its data when it is read counts for the term that reads
+    it first.
+    """
+
+    num_steps: int = 0
+    """Steps that were timed."""
+    step_time: float = 0.0
+    """Seconds of all steps."""
+    phases: dict[str, float] = field(default_factory=dict)
+    """Seconds of each phase; those of managers are named after them (`rewards`)."""
+    terms: dict[str, dict[str, float]] = field(default_factory=dict)
+    """For each manager, the seconds of each of its terms."""
+
+    def milliseconds(self, seconds: float) -> float:
+        """Return `seconds` of all steps as milliseconds of one."""
+        return 1e3 * seconds / max(self.num_steps, 1)
+
+    def percent(self, seconds: float) -> float:
+        """Return `seconds` as a part of all steps, in percent."""
+        return 100.0 * seconds / self.step_time if self.step_time else 0.0
+
+    @property
+    def other(self) -> float:
+        """Seconds of the steps that are of no phase."""
+        return max(self.step_time - sum(self.phases.values()), 0.0)
+
+
+@contextlib.contextmanager
+def profiled_steps(env: ManagerBasedRlEnv) -> Generator[StepProfile]:
+    """Time the steps that `env` makes within the block, also through wrappers around it.
+
+    On a GPU every part is waited for, so that its time is its own; steps take longer for that. The
+    environment is as it was after the block, whichever way that ends.
+    """
+    stopwatch = _Stopwatch(env.device)
+    with contextlib.ExitStack() as undo:
+        _Instrumentation(env, stopwatch, undo).install()
+        yield stopwatch.profile
+
+
+class _Stopwatch:
+    """Wraps calls so that their time is added to a profile."""
+
+    def __init__(self, device: str) -> None:
+        self.profile = StepProfile()
+        self._waits = torch.device(device).type == "cuda"
+        self._device = device
+        self._is_in_step = False
+        self._phase: str | None = None
+        self._term: str | None = None
+
+    def step(self, call: Callable[..., Any]) -> Callable[..., Any]:
+        """Return `call`, timed as a step."""
+
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            self._is_in_step = True
+            begin = self._now()
+            try:
+                result = call(*args, **kwargs)
+            finally:
+                self._is_in_step = False
+            self.profile.step_time += self._now() - begin
+            self.profile.num_steps += 1
+            return result
+
+        return timed
+
+    def phase(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        """Return `call`, timed as the phase `name` where it is called by a step itself."""
+        seconds = self.profile.phases
+        seconds.setdefault(name, 0.0)
+
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            if not self._is_in_step or self._phase is not None:
+                return call(*args, **kwargs)
+            self._phase = name
+            begin = self._now()
+            try:
+                return call(*args, **kwargs)
+            finally:
+                seconds[name] += self._now() - begin
+                self._phase = None
+
+        return timed
+
+    def term(self, phase: str, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        """Return `call`, timed as the term `name` where its manager calls it in its phase."""
+        seconds = self.profile.terms.setdefault(phase, {})
+        seconds.setdefault(name, 0.0)
+
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            if self._phase != phase or self._term is not None:
+                return call(*args, **kwargs)
+            self._term = name
+            begin = self._now()
+            try:
+                return call(*args, **kwargs)
+            finally:
+                seconds[name] += self._now() - begin
+                self._term = None
+
+        return timed
+
+    def _now(self) -> float:
+        if self._waits:
+            torch.cuda.synchronize(self._device)
+        return time.perf_counter()
+
+
+class _TimedFunction:
+    """Stands in for a term's function: calls it through a stopwatch, and is like it otherwise."""
+
+    def __init__(self, function: Any, timed: Callable[..., Any]) -> None:
+        object.__setattr__(self, "_function", function)
+        object.__setattr__(self, "_timed", timed)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return self._timed(*args, **kwargs)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._function, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        setattr(self._function, name, value)
+
+
+class _Instrumentation:
+    """Puts a stopwatch around what a step calls, and registers with `undo` what takes it off."""
+
+    def __init__(
+        self, env: ManagerBasedRlEnv, stopwatch: _Stopwatch, undo: contextlib.ExitStack
+    ) -> None:
+        self._env = env
+        self._stopwatch = stopwatch
+        self._undo = undo
+
+    def install(self) -> None:
+        """Put it around everything."""
+        self._replace(self._env, "step", self._stopwatch.step)
+        for owner, methods in ((self._env.sim, _SIMULATION), (self._env.scene, _SCENE)):
+            for method, phase in methods.items():
+                self._replace(owner, method, lambda call, p=phase: self._stopwatch.phase(p, call))
+        for phase, (attribute, methods) in _MANAGERS.items():
+            manager = getattr(self._env, attribute)
+            if isinstance(manager, NullManager):
+                continue
+            for method in methods:
+                self._replace(manager, method, lambda call, p=phase: self._stopwatch.phase(p, call))
+            self._install_terms(phase, manager)
+
+    def _install_terms(self, phase: str, manager: Any) -> None:
+        if phase == "observations":
+            for group in manager._groups.values():
+                for term in group.terms.values():
+                    self._time_methods(phase, term.label, term, ("compute",))
+        elif phase in _TERM_METHODS:
+            for name, term in manager._terms.items():
+                self._time_methods(phase, name, term, _TERM_METHODS[phase])
+            return
+        else:
+            for name, cfg in zip(manager._term_names, manager._term_cfgs, strict=True):
+                self._time_function(phase, name, cfg)
+        for name, term in manager._class_terms.items():
+            if callable(getattr(term, "reset", None)):
+                self._time_methods(phase, name, term, ("reset",))
+
+    def _time_methods(self, phase: str, name: str, term: Any, methods: tuple[str, ...]) -> None:
+        for method in methods:
+            self._replace(term, method, lambda call: self._stopwatch.term(phase, name, call))
+
+    def _time_function(self, phase: str, name: str, cfg: Any) -> None:
+        function = cfg.func
+        cfg.func = _TimedFunction(function, self._stopwatch.term(phase, name, function))
+        self._undo.callback(setattr, cfg, "func", function)
+
+    def _replace(
+        self, owner: Any, name: str, wrap: Callable[[Callable[..., Any]], Callable[..., Any]]
+    ) -> None:
+        """Put what `wrap` makes of a method of `owner` over it."""
+        own = vars(owner)
+        if name in own:
+            self._undo.callback(setattr, owner, name, own[name])
+        else:
+            self._undo.callback(delattr, owner, name)
+        setattr(owner, name, wrap(getattr(owner, name)))
 
 
 def main() -> None:
     """Entry point of `profile-env`."""
-    run_command(_command)
+    run_alias("profile-env")
 
 
 if __name__ == "__main__":

@@ -15,8 +15,8 @@ from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mjlab.scripts.cli import UserError
 from mjlab.scripts.run_folder import read_agent_params, read_env_params, read_run_info, sessions_of
+from mjlab.utils.errors import UserError
 
 if TYPE_CHECKING:
     import numpy as np

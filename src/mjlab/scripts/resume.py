@@ -9,15 +9,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjlab.scripts.cli import UserError, tell
-from mjlab.scripts.profiles import profile_of_run
+from mjlab.scripts.flags import profile_of_run
 from mjlab.scripts.run_folder import read_agent_params, read_env_params, read_run_info, run_folders
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
+from mjlab.utils.errors import UserError
+from mjlab.utils.logging import print_notice
 from mjlab.utils.processes import process_rank
+from mjlab.utils.random import draw_seed
 
 if TYPE_CHECKING:
     from mjlab.rl import MjlabOnPolicyRunner
-    from mjlab.scripts.train_run import TrainConfig
+    from mjlab.scripts.train_config import TrainConfig
 
 
 def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
@@ -81,12 +83,14 @@ def choices_to_resume(
     if "profile" not in given and (profile := profile_of_run(task, checkpoint.parent)) is not None:
         choices["profile"] = profile
         if _speaks_for_the_run():
-            tell(f"Resuming with the profile {profile!r}, as before; --profile gives another.")
+            print_notice(
+                f"Resuming with the profile {profile!r}, as before; --profile gives another."
+            )
     usual = load_rl_cfg(task, profile=choices.get("profile", cfg.profile))
     if "learner" not in given and learner != learner_of(usual):
         choices["learner"] = learner
         if _speaks_for_the_run():
-            tell(f"Resuming with the learner {learner!r}, as before.")
+            print_notice(f"Resuming with the learner {learner!r}, as before.")
     return choices
 
 
@@ -131,7 +135,7 @@ def keep_number_of_environments(task: str, cfg: TrainConfig, checkpoint: Path) -
         return
     count = _saved_num_envs(checkpoint)
     if count is None:
-        tell(
+        print_notice(
             f"{checkpoint} does not say how many environments its run had; the task's "
             f"{scene.num_envs} are used. --num-envs gives another number."
         )
@@ -140,12 +144,16 @@ def keep_number_of_environments(task: str, cfg: TrainConfig, checkpoint: Path) -
     print(f"Resuming with {count} environments, as before; --num-envs gives another number.")
 
 
-def seed_to_resume(checkpoint: Path | None) -> int | None:
-    """Return the seed of the run of `checkpoint`; None if there is none, or nothing says it."""
-    if checkpoint is None:
-        return None
-    seed: Any = read_agent_params(checkpoint.parent).get("seed")
-    return seed if isinstance(seed, int) and seed >= 0 else None
+def choose_seed(checkpoint: Path | None) -> int:
+    """Return the seed of the resumed run, or a new one, and print which."""
+    if checkpoint is not None:
+        seed: Any = read_agent_params(checkpoint.parent).get("seed")
+        if isinstance(seed, int) and seed >= 0:
+            print(f"Seed:    {seed}, as before; --agent.seed gives another")
+            return seed
+    seed = draw_seed()
+    print(f"Seed:    {seed}, drawn; --agent.seed {seed} repeats the run")
+    return seed
 
 
 def is_finished(cfg: TrainConfig, runner: MjlabOnPolicyRunner, checkpoint: Path) -> bool:

@@ -15,7 +15,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from mjlab.scripts.cli import UserError, tell
+from mjlab.utils.errors import UserError
+from mjlab.utils.logging import print_notice
 from mjlab.utils.os import remove_temporary_files
 
 _INFO_FILE = "run.json"
@@ -87,7 +88,7 @@ def exit_by_signal(unless: Callable[[], bool]) -> Generator[None]:
         if unless():
             os.kill(os.getpid(), number)
             return
-        tell(f"{signal.Signals(number).name}: stopped before the first iteration.")
+        print_notice(f"{signal.Signals(number).name}: stopped before the first iteration.")
         raise SystemExit(128 + number)
 
     def restore() -> None:
@@ -218,7 +219,7 @@ def newest_checkpoint(experiment: Path, task: str, learner: str | None = None) -
     return None
 
 
-def named_checkpoint(path: Path, task: str) -> Path:
+def resolve_checkpoint(path: Path, task: str) -> Path:
     """Return the checkpoint at `path`, which may leave out the run's folder.
 
     `logs/rsl_rl/cartpole/model_500.pt` is then that file of the newest run of `task`, or the last
@@ -237,7 +238,9 @@ def named_checkpoint(path: Path, task: str) -> Path:
             return sibling
         ended = read_run_info(newest.parent).get("ended")
         if ended in ("solved", "finished") and int(match.group(1)) > _number(newest):
-            tell(f"The newest run was {ended} before {path.name}. Its last checkpoint: {newest}")
+            print_notice(
+                f"The newest run was {ended} before {path.name}. Its last checkpoint: {newest}"
+            )
             return newest
     raise UserError(_missing(path, task))
 

@@ -1,61 +1,228 @@
-"""Train a task: `uv run train TASK [flags]`."""
+"""Train a task: `uv run train TASK [flags]`. From the flags to the folder of the run."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import contextlib
+import sys
+from collections.abc import Generator
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mjlab.compat import older_names
-from mjlab.scripts.cli import run_command, task_and_flags, task_usage
+from mjlab.rl.distributed import (
+    ProcessOutput,
+    broadcast_from_first,
+    fail_together,
+    joined_processes,
+    launch_workers,
+    log_file,
+    output_of,
+)
+from mjlab.scripts.cli import run_alias
+from mjlab.scripts.devices import gpus_to_share, training_device
+from mjlab.scripts.display import KeepRunFolder, TrainingDisplay, leave_results, report_divergence
+from mjlab.scripts.environments import training_env, training_runner
+from mjlab.scripts.flags import (
+    parse_with_choices,
+    prepare_env_cfg,
+    suggest_profile,
+    tell_foreign_learner,
+    with_task_options,
+)
+from mjlab.scripts.policy import prepare_teacher
+from mjlab.scripts.resume import (
+    check_learner_resumes,
+    checkpoint_to_resume,
+    choices_to_resume,
+    choose_seed,
+    is_finished,
+    keep_number_of_environments,
+)
+from mjlab.scripts.run_folder import (
+    NewRunFolder,
+    SharedRunFolder,
+    exit_by_signal,
+    write_resumed,
+    write_run_info,
+)
+from mjlab.scripts.train_config import TrainConfig, check_flags, check_typed_flags
+from mjlab.utils.os import dump_yaml
+from mjlab.utils.processes import ProcessRank, end_with_launcher, process_rank
+from mjlab.utils.torch import prepare_torch
 
 if TYPE_CHECKING:
-    from mjlab.scripts.train_run import TrainConfig as TrainConfig
+    from mjlab.rl import MjlabOnPolicyRunner
 
-_USAGE = task_usage(
-    "train",
-    "Train a policy, by PPO or, with --learner sac, by SAC. Checkpoints, curves and the exported policy go to "
-    "logs/rsl_rl/<experiment>/<time>/.",
-    [
-        "train Mjlab-Cartpole-Swingup --num-envs 4096",
-        "train Mjlab-Cartpole-Swingup --agent.algorithm.learning-rate 3e-4 --agent.seed 1",
-        "train Mjlab-Cartpole-Swingup --agent.resume True",
-        "train Mjlab-Velocity-Flat-Unitree-Go1 --profile cpu",
-        "train Mjlab-Velocity-Flat-Unitree-Go1 --learner sac --agent.algorithm.batch-size 1024",
-    ],
-)
+__getattr__ = older_names(__name__)
 
 
-def __getattr__(name: str) -> Any:
-    # The parts behind the command line load torch; the command line itself does not.
-    if name in ("TrainConfig", "launch_training", "run_train"):
-        from mjlab.scripts import train_run
-
-        return getattr(train_run, name)
-    return older_names(__name__)(name)
-
-
-def _command(argv: list[str]) -> None:
-    task, flags = task_and_flags(argv, _USAGE)
-    from mjlab.scripts.train_checks import check_flags, check_typed_flags
-    from mjlab.scripts.train_run import launch_training, parse_train_flags
-    from mjlab.scripts.training_device import gpus_to_share
-
-    cfg = parse_train_flags(task, flags, prog=f"train {task}")
+def command(argv: list[str], prog: str) -> None:
+    """Run `train`; with several GPUs, start a process for each."""
+    task, *flags = argv
+    cfg = parse_train_flags(task, flags, prog=f"{prog} {task}")
     check_typed_flags(cfg, flags)
     gpus = gpus_to_share(cfg)
     if not gpus:
         launch_training(task, cfg)
         return
-    from mjlab.scripts.launcher import launch_workers, train_command
-
     check_flags(cfg)
     # Of the GPUs that they see, the processes use all.
-    command = train_command(task, [*flags, "--gpu-ids", "all"])
-    launch_workers(command, len(gpus), {"CUDA_VISIBLE_DEVICES": ",".join(map(str, gpus))})
+    workers = [sys.executable, "-m", "mjlab.scripts.train", task, *flags, "--gpu-ids", "all"]
+    launch_workers(workers, len(gpus), {"CUDA_VISIBLE_DEVICES": ",".join(map(str, gpus))})
+
+
+def parse_train_flags(task: str, flags: list[str], prog: str) -> TrainConfig:
+    """Return the configuration of `task` with what `flags` change; exits on an unknown flag.
+
+    Raises:
+        UnknownProfileError: the task has no such profile.
+        ValueError: the learner is unknown, or is not for this task.
+    """
+    return parse_with_choices(
+        lambda **choices: with_task_options(TrainConfig.from_task(task, **choices), task),
+        lambda cfg, given: choices_to_resume(task, cfg, given),
+        flags,
+        prog,
+    )
+
+
+def launch_training(task: str, cfg: TrainConfig) -> Path:
+    """Train `task` as `cfg` says; return the run's folder.
+
+    Nothing is trained where the run to resume has all its iterations; that run's folder is then
+    returned. A run that fails before its first iteration leaves no folder.
+
+    Raises:
+        UserError, ValueError, OSError, CheckpointError, EngineUnavailableError: what was asked for
+            cannot be done; raised before training starts wherever that can be known.
+    """
+    end_with_launcher()
+    rank = process_rank()
+    # Of all processes, the first alone says which device there is. All say for whom they wait.
+    with output_of(rank):
+        device = training_device(cfg, rank)
+    with joined_processes(device), output_of(rank) as output:
+        prepare_torch(device)
+        with fail_together():
+            check_flags(cfg)
+        return _train(task, cfg, device, rank, output)
+
+
+run_train = launch_training
+
+
+def _train(
+    task: str, cfg: TrainConfig, device: str, rank: ProcessRank, output: ProcessOutput | None
+) -> Path:
+    # The checkpoint is looked for before there is a new folder to be found, and by one process.
+    checkpoint = broadcast_from_first(lambda: checkpoint_to_resume(task, cfg))
+    if cfg.agent.seed == -1:
+        cfg.agent.seed = broadcast_from_first(lambda: choose_seed(checkpoint))
+    cfg.apply_short_forms(rank)
+    if checkpoint is not None:
+        check_learner_resumes(cfg, checkpoint)
+        keep_number_of_environments(task, cfg, checkpoint)
+    else:
+        suggest_profile(task, cfg.profile, device)
+        if rank.is_first:
+            tell_foreign_learner(task, cfg.profile, cfg.learner_name)
+    with fail_together():
+        prepare_teacher(task, cfg.agent, checkpoint)
+    with _run_folder(cfg, rank, output) as folder:
+        with fail_together():
+            fetched_from = None if checkpoint is None else cfg.wandb_run_path
+            prepare_env_cfg(task, cfg, cfg.env, checkpoint, fetched_from)
+            env = training_env(cfg, device, folder.path, rank)
+        try:
+            under = f", profile {cfg.profile}" if cfg.profile else ""
+            under += "" if cfg.learner_name == "ppo" else f", learner {cfg.learner_name}"
+            each = "" if rank.is_alone else f" in each of {rank.world_size} processes"
+            print(f"Task:    {task}, {env.num_envs} environments{each}{under}")
+            print(f"Physics: {env.unwrapped.sim.capabilities.description}", flush=True)
+            with fail_together():
+                runner = training_runner(task, cfg, env, folder.path, device)
+                if checkpoint is not None:
+                    runner.load(str(checkpoint))
+                elif (teacher := getattr(cfg.agent, "teacher_checkpoint", None)) is not None:
+                    runner.load_teacher(teacher)
+            if checkpoint is not None:
+                if is_finished(cfg, runner, checkpoint):
+                    return checkpoint.parent
+                print(f"Resumed: {checkpoint}, iteration {runner.current_learning_iteration}")
+            print(f"Run:     {folder.path}", flush=True)
+            if rank.is_first:
+                _write_params(task, cfg, folder.path, checkpoint)
+            try:
+                _learn(task, cfg, runner, folder)
+            finally:
+                if rank.is_first:
+                    report_divergence(env.unwrapped)
+        finally:
+            env.close()
+    if rank.is_first:
+        leave_results(task, cfg, folder.path, device)
+    return folder.path
+
+
+@contextlib.contextmanager
+def _run_folder(
+    cfg: TrainConfig, rank: ProcessRank, output: ProcessOutput | None
+) -> Generator[NewRunFolder | SharedRunFolder]:
+    """Be in the run's folder, which the first process makes for all."""
+    experiment = Path(cfg.log_root).resolve() / cfg.agent.experiment_name
+    with contextlib.ExitStack() as stack:
+        new = NewRunFolder(experiment, cfg.agent.run_name)
+        stack.enter_context(exit_by_signal(unless=lambda: new.is_kept))
+        path = broadcast_from_first(lambda: stack.enter_context(new).path)
+        if output is not None:
+            output.keep_in(log_file(rank, cfg.torchrunx_log_dir, path))
+        yield new if rank.is_first else SharedRunFolder(path)
+
+
+def _write_params(task: str, cfg: TrainConfig, run_dir: Path, checkpoint: Path | None) -> None:
+    write_run_info(
+        run_dir, task=task, profile=cfg.profile, learner=cfg.learner_name, command=sys.argv
+    )
+    if checkpoint is not None:
+        write_resumed(run_dir, checkpoint)
+    dump_yaml(run_dir / "params" / "env.yaml", asdict(cfg.env))
+    dump_yaml(run_dir / "params" / "agent.yaml", asdict(cfg.agent))
+
+
+def _learn(
+    task: str,
+    cfg: TrainConfig,
+    runner: MjlabOnPolicyRunner,
+    folder: NewRunFolder | SharedRunFolder,
+) -> None:
+    if isinstance(folder, SharedRunFolder):
+        runner.learn(cfg.agent.max_iterations, init_at_random_ep_len=True)
+        return
+    runner.observers += [KeepRunFolder(folder), TrainingDisplay(task)]
+    if cfg.live:
+        from mjlab.scripts.live import LiveView
+
+        # First, because the display keeps the terminal to itself once it has started.
+        runner.observers.insert(0, LiveView(task, cfg, runner))
+    try:
+        runner.learn(cfg.agent.max_iterations, init_at_random_ep_len=True)
+        # A task's own runner may have its own loop, which need not tell that it starts.
+        folder.keep()
+    finally:
+        # On a full disk, what the folder says about its end is not worth hiding the error that
+        # says which checkpoint is intact.
+        with contextlib.suppress(OSError):
+            write_run_info(
+                folder.path,
+                ended=runner.stop_reason,
+                iterations=runner.current_learning_iteration,
+            )
 
 
 def main() -> None:
     """Entry point of `train`."""
-    run_command(_command)
+    run_alias("train")
 
 
 if __name__ == "__main__":

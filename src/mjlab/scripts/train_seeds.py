@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import signal
@@ -10,15 +11,10 @@ import sys
 from pathlib import Path
 from types import FrameType
 
-from mjlab.scripts.cli import (
-    BadCallError,
-    UserError,
-    is_given,
-    run_command,
-    task_and_flags,
-    task_usage,
-)
+from mjlab.scripts.cli import run_alias
+from mjlab.scripts.flags import is_given
 from mjlab.scripts.run_folder import read_run_info, run_folders
+from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.processes import PARENT_VARIABLE
 
 # Signals that end this process, and what the training process gets for each: it handles the first
@@ -29,32 +25,24 @@ _FORWARDED: dict[int, signal.Signals] = {
     signal.SIGHUP: signal.SIGTERM,
 }
 _SEEDS_HELP = "--seeds N    Train with the seeds 1, 2, ..., N, one after the other (default: 5)."
-_USAGE = task_usage(
-    "train-seeds",
-    "Train a task once for each seed 1, 2, ..., N (5 unless --seeds says otherwise), one run after "
-    "the other, each to its last iteration. All other flags are those of `train`.",
-    [
-        "train-seeds Mjlab-Cartpole-Swingup --num-envs 512 --agent.max-iterations 100",
-        "plot-seeds logs/rsl_rl/cartpole/*_seed_? --output swingup.png",
-    ],
-)
 
 
-def _command(argv: list[str]) -> None:
-    task, flags = task_and_flags(argv, _USAGE)
-    count, flags = _take_count(flags)
+def command(argv: list[str], prog: str) -> None:
+    """Run `train-seeds`."""
+    task = argv[0]
+    count, flags = _take_count(argv[1:])
     if "-h" in flags or "--help" in flags:
         print(f"{_SEEDS_HELP}\nAll other flags are those of `train`:\n", flush=True)
-    experiment = _experiment(task, flags)
+    experiment = _experiment(task, flags, prog)
     for seed in range(1, count + 1):
         print(f"\nSeed {seed} of {count}", flush=True)
         # Curves to be averaged must be of one length, so that no run may stop when it is solved,
         # whatever that means for the task. Flags given by hand come last and win.
-        command = [sys.executable, "-m", "mjlab.scripts.train", task]
-        command += ["--agent.evaluation.stop-when-solved", "False"]
-        command += [*flags, "--agent.seed", str(seed), "--agent.run-name", f"seed_{seed}"]
+        arguments = [sys.executable, "-m", "mjlab.scripts.train", task]
+        arguments += ["--agent.evaluation.stop-when-solved", "False"]
+        arguments += [*flags, "--agent.seed", str(seed), "--agent.run-name", f"seed_{seed}"]
         before = set(run_folders(experiment))
-        status, stopped = run_forwarding_signals(command)
+        status, stopped = run_forwarding_signals(arguments)
         # A signal that went to the training process alone ends it with 0 as well.
         if stopped or (status == 0 and _interrupted(experiment, before, seed)):
             print(f"Stopped during seed {seed} of {count}; no other seed is trained.")
@@ -80,12 +68,12 @@ def _take_count(flags: list[str]) -> tuple[int, list[str]]:
     return 5, flags
 
 
-def _experiment(task: str, flags: list[str]) -> Path:
+def _experiment(task: str, flags: list[str], prog: str) -> Path:
     """Return the folder that the runs go to. Mistaken flags end the command here, `--help` too."""
-    from mjlab.scripts.train_checks import check_typed_flags
-    from mjlab.scripts.train_run import parse_train_flags
+    from mjlab.scripts.train import parse_train_flags
+    from mjlab.scripts.train_config import check_typed_flags
 
-    cfg = parse_train_flags(task, flags, prog=f"train-seeds {task}")
+    cfg = parse_train_flags(task, flags, prog=f"{prog} {task}")
     check_typed_flags(cfg, flags)
     for flag in ("--agent.seed", "--agent.run-name"):
         if is_given(flag, flags):
@@ -149,9 +137,29 @@ def run_forwarding_signals(command: list[str], seconds: float | None = None) -> 
             signal.signal(number, old if old is not None else signal.SIG_DFL)
 
 
+def plot_command(argv: list[str], prog: str) -> None:
+    """Run `plot-seeds`."""
+    parser = argparse.ArgumentParser(
+        prog=prog,
+        description="Draw the mean over runs, with one sample standard deviation shaded.",
+    )
+    parser.add_argument("runs", nargs="+", type=Path, help="folders of the runs")
+    parser.add_argument("--output", type=Path, default=Path("seeds.png"), help="PNG to write")
+    parser.add_argument("--tag", help="figure to draw, as TensorBoard calls it")
+    parser.add_argument("--title", help="title of the plot")
+    args = parser.parse_args(argv)
+    missing = [str(run) for run in args.runs if not run.is_dir()]
+    if missing:
+        raise UserError(f"Not folders of runs: {', '.join(missing)}.")
+    from mjlab.rl.plot import DEFAULT_TAG, plot_seeds
+
+    path = plot_seeds(args.runs, args.output, tag=args.tag or DEFAULT_TAG, title=args.title)
+    print(path)
+
+
 def main() -> None:
     """Entry point of `train-seeds`."""
-    run_command(_command)
+    run_alias("train-seeds")
 
 
 if __name__ == "__main__":

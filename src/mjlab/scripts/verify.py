@@ -9,15 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mjlab.scripts.cli import (
-    BadCallError,
-    UserError,
-    parse_flags,
-    resolve_device,
-    run_command,
-    task_and_flags,
-    task_usage,
-)
+from mjlab.scripts.cli import run_alias
+from mjlab.scripts.devices import resolve_device
+from mjlab.scripts.flags import parse_flags
 from mjlab.scripts.reference import (
     DATA,
     ENDED,
@@ -34,21 +28,13 @@ from mjlab.scripts.reference import (
     samples_limit,
 )
 from mjlab.scripts.run_folder import read_run_info, run_folders, sessions_of
+from mjlab.utils.errors import BadCallError, UserError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from mjlab.scripts.train_run import TrainConfig
+    from mjlab.scripts.train_config import TrainConfig
 
-_USAGE = task_usage(
-    "verify",
-    "Train a task with one seed and say whether its learning curve lies within the band of the "
-    "reference runs that ship with the package. Exit status: 0 within, 1 outside, 2 for a bad call.",
-    [
-        "verify Mjlab-Cartpole-Swingup",
-        "verify Mjlab-Velocity-Flat-Unitree-Go1 --device cpu --seed 1",
-    ],
-)
 _OUTSIDE = 1
 # Rows of the printed table.
 _ROWS = 5
@@ -99,10 +85,11 @@ def load_reference(task: str, cfg: VerifyConfig) -> Reference:
     )
 
 
-def _prepare(argv: list[str]) -> tuple[str, VerifyConfig, Reference, TrainConfig, Path | None]:
+def _prepare(
+    task: str, flags: list[str], prog: str
+) -> tuple[VerifyConfig, Reference, TrainConfig, Path | None]:
     """Return what to compare, the training, and the finished run if there is nothing to train."""
-    task, flags = task_and_flags(argv, _USAGE)
-    cfg = parse_flags(VerifyConfig, VerifyConfig(), flags, f"verify {task}")
+    cfg = parse_flags(VerifyConfig, VerifyConfig(), flags, f"{prog} {task}")
     reference = load_reference(task, cfg)
     resolve_device(cfg.device)
     if len(reference.seeds) < 2:
@@ -113,7 +100,7 @@ def _prepare(argv: list[str]) -> tuple[str, VerifyConfig, Reference, TrainConfig
     if cfg.seed in (seed.seed for seed in reference.seeds):
         # Allowed, since on another machine or with other libraries it is a new curve.
         print(f"Seed {cfg.seed} is one of the reference's, so that its curve may be the same.")
-    from mjlab.scripts.train_run import parse_train_flags
+    from mjlab.scripts.train import parse_train_flags
 
     train_flags = [*reference.train_flags, "--agent.seed", str(cfg.seed)]
     train_flags += ["--agent.run-name", f"verify_seed_{cfg.seed}", "--log-root", cfg.log_root]
@@ -126,7 +113,7 @@ def _prepare(argv: list[str]) -> tuple[str, VerifyConfig, Reference, TrainConfig
         sessions_of(run_dir)
         train_flags += ["--agent.resume", "True", "--agent.load-run", re.escape(run_dir.name)]
         done = run_dir if end_of(run_dir) in ENDED else None
-    return task, cfg, reference, parse_train_flags(task, train_flags, f"verify {task}"), done
+    return cfg, reference, parse_train_flags(task, train_flags, f"{prog} {task}"), done
 
 
 def _iterations(reference: Reference) -> int:
@@ -219,15 +206,15 @@ def _draw(reference: Reference, run: RunRecord, comparison: Comparison, output: 
     )
 
 
-def _command(argv: list[str]) -> None:
-    from mjlab.tasks.registry import UnknownTaskError
-
+def command(argv: list[str], prog: str) -> None:
+    """Run `verify`: exits 0 if the curve is within the band, 1 if not, 2 for a bad call."""
+    task, *flags = argv
     try:
-        task, cfg, reference, train_cfg, run_dir = _prepare(argv)
-    except (UserError, UnknownTaskError, ValueError, OSError) as error:
+        cfg, reference, train_cfg, run_dir = _prepare(task, flags, prog)
+    except (UserError, ValueError, OSError) as error:
         raise BadCallError(str(error)) from error
     if run_dir is None:
-        from mjlab.scripts.train_run import launch_training
+        from mjlab.scripts.train import launch_training
 
         run_dir = launch_training(task, train_cfg)
     try:
@@ -260,8 +247,8 @@ def _command(argv: list[str]) -> None:
 
 
 def main() -> None:
-    """Entry point of `verify`: exits 0 if the curve is within the band, 1 if not."""
-    run_command(_command)
+    """Entry point of `verify`."""
+    run_alias("verify")
 
 
 if __name__ == "__main__":

@@ -1,14 +1,37 @@
-"""Look at terrains in the browser: `python -m mjlab.scripts.visualize_terrain pyramid_stairs`."""
+"""Look at terrains in the browser: `mjlab visualize-terrain pyramid_stairs`."""
 
 from __future__ import annotations
 
+import dataclasses
+import threading
+import typing
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import mujoco
+import numpy as np
 import tyro
+import viser
 
-from mjlab.scripts.cli import UserError, run_command
-from mjlab.scripts.terrain_knobs import RobotName
+import mjlab
+from mjlab.scripts.cli import run_alias
+from mjlab.terrains import SubTerrainCfg
+from mjlab.terrains.config import ALL_TERRAIN_PRESETS
+from mjlab.utils.errors import UserError
+from mjlab.viewer.camera import CameraView
+from mjlab.viewer.viser.scene import MjlabViserScene
+
+if TYPE_CHECKING:
+    from mjlab.entity import EntityCfg
+    from mjlab.terrains import SubTerrainCfg
+RobotName = Literal["unitree_go1", "unitree_g1", "none"]
+Kind = Literal["number", "count", "range", "switch", "choice"]
+# What the page, not a control, decides, or what no slider can express.
+_NOT_CONTROLS = {"proportion", "size", "flat_patch_sampling"}
+# Sizes of pixels: near 0 a height field would have millions of them.
+_PIXELS = {"horizontal_scale", "vertical_scale", "resolution"}
+ALL = "all"
+ROBOTS: tuple[RobotName, ...] = ("unitree_go1", "unitree_g1", "none")
 
 
 @dataclass(frozen=True)
@@ -31,12 +54,9 @@ class VisualizeTerrainConfig:
     """Port to serve on; the next free one where it is taken."""
 
 
-def _command(argv: list[str]) -> None:
-    import mjlab
-
-    cfg = tyro.cli(
-        VisualizeTerrainConfig, args=argv, prog="visualize_terrain", config=mjlab.TYRO_FLAGS
-    )
+def command(argv: list[str], prog: str) -> None:
+    """Run `mjlab visualize-terrain`."""
+    cfg = tyro.cli(VisualizeTerrainConfig, args=argv, prog=prog, config=mjlab.TYRO_FLAGS)
     run_visualize_terrain(cfg)
 
 
@@ -62,7 +82,6 @@ def run_visualize_terrain(cfg: VisualizeTerrainConfig) -> None:
             f"num_levels is {cfg.num_levels}, size {cfg.size} and seed {cfg.seed}; they must be "
             "from 1 to 10, from 4 to 16 m, and not negative."
         )
-    from mjlab.scripts.terrain_page import TerrainPage
 
     server = serve_page(cfg.host, cfg.port)
     page = TerrainPage(server, cfg.terrain, cfg.num_levels, cfg.size, cfg.seed, cfg.robot)
@@ -73,9 +92,289 @@ def run_visualize_terrain(cfg: VisualizeTerrainConfig) -> None:
         server.stop()
 
 
+class TerrainPage:
+    """Shows one preset, or all of them side by side, at rising difficulty along x.
+
+    The page's controls only ask for a new terrain; it is built in the thread that calls `run`.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        terrain: str = "pyramid_stairs",
+        num_levels: int = 5,
+        size: float = 8.0,
+        seed: int = 0,
+        robot: RobotName = "unitree_go1",
+    ) -> None:
+        """Add the controls. The terrain is built by `rebuild`.
+
+        Args:
+            server: The page's server.
+            terrain: Preset to show first, or `all`.
+            num_levels: Number of difficulties.
+            size: Extent of each cell, in metres.
+            seed: Seed of the terrain.
+            robot: Robot that stands at the origin of each cell.
+        """
+        self.server = server
+        self.scene: TerrainScene | None = None
+        """What is shown, or None before the first `rebuild`."""
+        self._changed = threading.Event()
+        self._changed.set()
+        self._aimed_at: tuple[Any, ...] | None = None
+        gui = server.gui
+        self._status = gui.add_markdown("")
+        self._terrain = gui.add_dropdown(
+            "Terrain", (ALL, *ALL_TERRAIN_PRESETS), initial_value=terrain
+        )
+        self._levels = gui.add_slider("Difficulties", 1, 10, 1, initial_value=num_levels)
+        self._size = gui.add_slider("Size (m)", 4.0, 16.0, 0.5, initial_value=size)
+        self._seed = gui.add_number("Seed", initial_value=seed, min=0, step=1)
+        self._robot = gui.add_dropdown("Robot", ROBOTS, initial_value=robot)
+        self._folder = gui.add_folder("Parameters")
+        # The sliders, and which preset they belong to, change together.
+        self._lock = threading.Lock()
+        self._handles: dict[str, Any] = {}
+        self._preset = terrain
+        for handle in (self._levels, self._size, self._seed, self._robot):
+            handle.on_update(self._ask)
+        self._terrain.on_update(self._choose)
+        self._add_knobs()
+
+    @property
+    def status(self) -> str:
+        """The text above the controls: what is shown, or why it cannot be."""
+        return self._status.content
+
+    def run(self) -> None:
+        """Show what is asked for, until Ctrl-C."""
+        while True:
+            if self._changed.wait(timeout=0.2):
+                self.rebuild()
+
+    def rebuild(self) -> None:
+        """Build and show the terrain that the controls describe; the last one if it cannot be."""
+        self._changed.clear()
+        self._status.content = "Building ..."
+        try:
+            scene = build_terrain_scene(
+                self._kinds(), self._size.value, self._levels.value, self._seed.value,
+                self._robot.value,
+            )  # fmt: skip
+        except ValueError as error:
+            self._status.content = f"**This terrain cannot be built.** {error}"
+            return
+        self.scene = scene
+        self._draw(scene)
+        levels, kinds, _ = scene.origins.shape
+        self._status.content = (
+            f"{kinds} x {levels} terrains, {scene.model.ngeom} geoms, "
+            f"{scene.num_polygons:,} polygons"
+        )
+
+    def _kinds(self) -> dict[str, SubTerrainCfg]:
+        with self._lock:
+            name = self._preset
+            values = {field: handle.value for field, handle in self._handles.items()}
+        if name == ALL:
+            return {name: preset() for name, preset in ALL_TERRAIN_PRESETS.items()}
+        return {name: with_values(ALL_TERRAIN_PRESETS[name](), values)}
+
+    def _draw(self, scene: TerrainScene) -> None:
+        levels, kinds, _ = scene.origins.shape
+        size = self._size.value
+        extent = max(levels, kinds) * size
+        positions, rotations = scene.poses()
+        with self.server.atomic():
+            self.server.scene.reset()
+            view = CameraView(None, (0.0, 0.0, 0.0), 0.8 * extent, 60.0, -35.0, None)
+            shown = MjlabViserScene(self.server, scene.model, len(positions), view=view)
+            shown.update_from_arrays(positions, rotations)
+            # Where the person looks from is theirs, unless the grid is another one.
+            if (levels, kinds, size) != self._aimed_at:
+                shown.aim()
+        self._aimed_at = (levels, kinds, size)
+
+    # Controls. They are called from the server's threads.
+
+    def _ask(self, _: Any = None) -> None:
+        self._changed.set()
+
+    def _choose(self, _: Any) -> None:
+        self._add_knobs()
+        self._ask()
+
+    def _add_knobs(self) -> None:
+        """Replace the sliders by those of the chosen preset."""
+        with self._lock, self._folder:
+            for handle in self._handles.values():
+                handle.remove()
+            self._handles, self._preset = {}, self._terrain.value
+            if self._preset == ALL:
+                return
+            for control in controls_of(ALL_TERRAIN_PRESETS[self._preset]()):
+                handle = self._add_control(control)
+                handle.on_update(self._ask)
+                self._handles[control.field] = handle
+
+    def _add_control(self, control: FieldControl) -> Any:
+        gui, label = self.server.gui, control.field
+        if control.kind == "switch":
+            return gui.add_checkbox(label, control.value)
+        if control.kind == "choice":
+            return gui.add_dropdown(label, control.options, initial_value=control.value)
+        if control.kind == "count":
+            return gui.add_slider(label, int(control.low), int(control.high), 1, control.value)
+        step = (control.high - control.low) / 200
+        if control.kind == "range":
+            return gui.add_multi_slider(label, control.low, control.high, step, control.value)
+        return gui.add_slider(label, control.low, control.high, step, control.value)
+
+
+# The terrain.
+
+
+@dataclass(frozen=True)
+class TerrainScene:
+    """A compiled terrain with one robot, and where to draw the robot."""
+
+    model: mujoco.MjModel
+    """The terrain, and the robot if there is one."""
+    origins: np.ndarray
+    """(levels, kinds, 3) spawn points."""
+    num_polygons: int
+    """Triangles of the terrain's surface."""
+
+    def poses(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (n, nbody, 3) positions and (n, nbody, 3, 3) rotations, one for each origin."""
+        data = mujoco.MjData(self.model)
+        if self.model.nkey:
+            mujoco.mj_resetDataKeyframe(self.model, data, 0)
+        mujoco.mj_kinematics(self.model, data)
+        origins = self.origins.reshape(-1, 3)
+        positions = np.repeat(data.xpos[None], len(origins), axis=0)
+        # The world and the terrain stay where they are.
+        moving = self.model.body_weldid > 0
+        positions[:, moving] += origins[:, None]
+        return positions, np.repeat(data.xmat.reshape(1, -1, 3, 3), len(origins), axis=0)
+
+
+def build_terrain_scene(
+    kinds: dict[str, SubTerrainCfg], size: float, num_levels: int, seed: int, robot: RobotName
+) -> TerrainScene:
+    """Build a grid with one column for each kind and rows of rising difficulty.
+
+    Args:
+        kinds: Sub-terrains by name.
+        size: Extent of each cell, in metres.
+        num_levels: Number of rows.
+        seed: Seed of the terrain.
+        robot: Robot to place.
+
+    Raises:
+        ValueError: the terrain cannot be built.
+    """
+    from mjlab.scene import Scene, SceneCfg
+    from mjlab.terrains import TerrainEntityCfg, TerrainGeneratorCfg
+
+    generator = TerrainGeneratorCfg(
+        seed=seed,
+        curriculum=True,
+        size=(size, size),
+        num_rows=num_levels,
+        border_width=1.0,
+        sub_terrains=kinds,
+        add_lights=True,
+    )
+    terrain = TerrainEntityCfg(terrain_type="generator", terrain_generator=generator)
+    entities = {} if robot == "none" else {"robot": _robot_cfg(robot)}
+    scene = Scene(SceneCfg(terrain=terrain, entities=entities), "cpu")
+    model = scene.compile()
+    return TerrainScene(model, scene["terrain"].terrain_origins.numpy(), count_polygons(model))
+
+
+def _robot_cfg(robot: RobotName) -> EntityCfg:
+    from mjlab.asset_zoo import robots
+
+    return robots.get_go1_robot_cfg() if robot == "unitree_go1" else robots.get_g1_robot_cfg()
+
+
+def count_polygons(model: mujoco.MjModel) -> int:
+    """Return the number of triangles of the geoms of the body `terrain`."""
+    total = 0
+    for geom in np.flatnonzero(model.geom_bodyid == model.body("terrain").id):
+        kind, shape = model.geom_type[geom], model.geom_dataid[geom]
+        if kind == mujoco.mjtGeom.mjGEOM_HFIELD:
+            total += 2 * int((model.hfield_nrow[shape] - 1) * (model.hfield_ncol[shape] - 1))
+        elif kind == mujoco.mjtGeom.mjGEOM_MESH:
+            total += int(model.mesh_facenum[shape])
+        else:
+            # A box.
+            total += 12
+    return total
+
+
+# Fields that can be changed on the page.
+
+
+@dataclass(frozen=True)
+class FieldControl:
+    """One field of a config, and how it is shown."""
+
+    field: str
+    """Name of the field."""
+    kind: Kind
+    """A float, an int, a pair of floats, a bool, or one of several words."""
+    value: Any
+    """What it is now."""
+    low: float = 0.0
+    """Lowest value of a slider."""
+    high: float = 1.0
+    """Highest value of a slider."""
+    options: tuple[str, ...] = ()
+    """The words of a choice."""
+
+
+def controls_of(cfg: SubTerrainCfg) -> list[FieldControl]:
+    """Return the controls of a config, in the order of its fields. Fields that are None have none."""
+    hints = typing.get_type_hints(type(cfg))
+    controls = []
+    for field in dataclasses.fields(cfg):
+        if field.name in _NOT_CONTROLS:
+            continue
+        control = _control(field.name, getattr(cfg, field.name), hints[field.name])
+        if control is not None:
+            controls.append(control)
+    return controls
+
+
+def _control(name: str, value: Any, hint: Any) -> FieldControl | None:
+    if isinstance(value, bool):
+        return FieldControl(name, "switch", value)
+    if typing.get_origin(hint) is Literal:
+        return FieldControl(name, "choice", value, options=typing.get_args(hint))
+    if isinstance(value, int):
+        return FieldControl(name, "count", value, 1, 3 * max(value, 1))
+    if isinstance(value, float):
+        if name in _PIXELS:
+            return FieldControl(name, "number", value, value / 2, 4 * value)
+        return FieldControl(name, "number", value, min(0.0, 2 * value), max(1.0, 2 * value))
+    if isinstance(value, tuple) and len(value) == 2:
+        low, high = value
+        return FieldControl(name, "range", value, min(0.0, 2 * low), max(2 * high, 0.1))
+    return None
+
+
+def with_values(cfg: SubTerrainCfg, values: dict[str, Any]) -> SubTerrainCfg:
+    """Return a copy of the config with the values of controls."""
+    typed = {name: tuple(v) if isinstance(v, (list, tuple)) else v for name, v in values.items()}
+    return dataclasses.replace(cfg, **typed)
+
+
 def main() -> None:
-    """Entry point of `python -m mjlab.scripts.visualize_terrain`."""
-    run_command(_command)
+    """Entry point of `visualize-terrain`."""
+    run_alias("visualize-terrain")
 
 
 if __name__ == "__main__":

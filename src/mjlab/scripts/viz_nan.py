@@ -2,45 +2,233 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import copy
+import hashlib
+import threading
+from dataclasses import dataclass
+from typing import Any
 
-from mjlab.scripts.cli import first_and_flags, parse_flags, run_command
+import mujoco
+import numpy as np
+import viser
 
-if TYPE_CHECKING:
-    from mjlab.scripts.viz_nan_run import VizNanConfig as VizNanConfig
+from mjlab.scripts.cli import run_alias
+from mjlab.scripts.flags import parse_flags
+from mjlab.utils.errors import UserError
+from mjlab.utils.nan_guard import NanDump
+from mjlab.viewer.camera import whole_model_view
+from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS, host_model
+from mjlab.viewer.page_server import check_address, page_url, serve_page
+from mjlab.viewer.viser.scene import MjlabViserScene
 
-_USAGE = """\
-usage: viz-nan DUMP [flags]
-
-Show the states that led to a NaN. DUMP is what `train --enable-nan-guard True` wrote when one
-appeared, such as nan_dump_latest.npz; the model is read from the same folder.
-
-example:
-    uv run viz-nan /tmp/mjlab/nan_dumps/nan_dump_latest.npz
-
-flags:
-    --host ADDRESS      address to serve on; 0.0.0.0 is the whole network (default: 127.0.0.1)
-    --port N            port to serve on; the next free one where it is taken (default: 8080)"""
-
-
-def __getattr__(name: str) -> Any:
-    if name in ("VizNanConfig", "run_viz_nan"):
-        from mjlab.scripts import viz_nan_run
-
-        return getattr(viz_nan_run, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+_FIELDS = ("qpos", "qvel", "act", "ctrl", "xfrc_applied", "qacc")
+_SHOWN_ENVS = 10
 
 
-def _command(argv: list[str]) -> None:
-    dump, flags = first_and_flags(argv, _USAGE, "dump", argv)
-    from mjlab.scripts.viz_nan_run import VizNanConfig, run_viz_nan
+@dataclass(frozen=True)
+class VizNanConfig:
+    """Flags of `viz-nan`."""
 
-    run_viz_nan(dump, parse_flags(VizNanConfig, VizNanConfig(), flags, "viz-nan DUMP"))
+    host: str = "127.0.0.1"
+    """Address to serve on; `0.0.0.0` serves the whole network."""
+    port: int = 8080
+    """Port to serve on; the next free one where it is taken."""
+
+
+def command(argv: list[str], prog: str) -> None:
+    """Run `viz-nan`."""
+    dump, *flags = argv
+    run_viz_nan(dump, parse_flags(VizNanConfig, VizNanConfig(), flags, f"{prog} DUMP"))
+
+
+def run_viz_nan(path: str, cfg: VizNanConfig) -> None:
+    """Serve the page of the dump at `path` until Ctrl-C.
+
+    Raises:
+        UserError: the dump or its model is missing or cannot be read.
+        ValueError: the page cannot be served at that address.
+    """
+    check_address(cfg.host, cfg.port, "--")
+    dump, model = load_dump(path)
+
+    server = serve_page(cfg.host, cfg.port)
+    page = NanPage(server, dump, model)
+    print(f"Serving {path} on {page_url(server)} (Ctrl-C stops).", flush=True)
+    try:
+        page.run()
+    finally:
+        server.stop()
+
+
+def load_dump(path: str) -> tuple[NanDump, mujoco.MjModel]:
+    """Return a dump and the model it was recorded with.
+
+    Raises:
+        UserError: either is missing or cannot be read; the text says which and why.
+    """
+    try:
+        dump = NanDump.load(path)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    except FileNotFoundError:
+        raise UserError(
+            f"There is no dump {path}. `train --enable-nan-guard True` writes one when a NaN "
+            "appears, and says where."
+        ) from None
+    if not dump.steps:
+        raise UserError(f"The dump {path} holds no states.")
+    if not dump.model_file.is_file():
+        raise UserError(
+            f"The dump {path} needs its model, {dump.model_file.name}, in the same folder. Copy "
+            "both."
+        )
+    digest = hashlib.sha256(dump.model_file.read_bytes()).hexdigest()
+    # MuJoCo itself reads most damaged models without a word. Earlier dumps do not say.
+    if dump.metadata.get("model_sha256", digest) != digest:
+        raise UserError(
+            f"The model {dump.model_file} is not that of the dump {path}: it was changed or damaged. "
+            "Copy both again."
+        )
+    try:
+        model = mujoco.MjModel.from_binary_path(str(dump.model_file))
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
+        raise UserError(
+            f"The model {dump.model_file} cannot be read by MuJoCo {mujoco.__version__}; it has to "
+            f"be the version that wrote it. {error}"
+        ) from error
+    try:
+        size = mujoco.mj_stateSize(model, dump.metadata["state_spec"])
+        if size != dump.metadata["state_size"]:
+            raise ValueError(f"its states have {dump.metadata['state_size']} numbers, not {size}")
+        written, data = copy.copy(model), mujoco.MjData(model)
+        for step in dump.steps:
+            dump.apply(step, 0, written, data)
+    except Exception as error:
+        raise UserError(
+            f"The dump {path} and its model {dump.model_file.name} are not of the same simulation: "
+            f"{error}."
+        ) from error
+    return dump, model
+
+
+class NanPage:
+    """Shows the recorded states of one environment, with sliders for substep and environment.
+
+    Controls only ask for another state; it is set, computed and drawn in the thread that calls
+    `run`.
+    """
+
+    def __init__(self, server: viser.ViserServer, dump: NanDump, model: mujoco.MjModel) -> None:
+        """Build the page, and show the last state: the one that led to the NaN.
+
+        Args:
+            server: The page's server.
+            dump: The dump.
+            model: The model it was recorded with; a copy is made, into which the values of the
+                environment in view are written.
+        """
+        self.dump = dump
+        self.model = host_model(model)
+        self.data = mujoco.MjData(self.model)
+        self._envs: list[int] = dump.metadata["dumped_env_ids"]
+        self._looks_differ = any(
+            name.removeprefix("model_") in VIEWER_MODEL_FIELDS
+            for name in dump.arrays
+            if name.startswith("model_")
+        )
+        self._row_shown = 0
+        self._changed = threading.Event()
+        gui = server.gui
+        gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        dump.apply(dump.steps[-1], 0, self.model, self.data)
+        view = whole_model_view(self.model)
+        self.scene = MjlabViserScene(server, self.model, 1, view=view)
+        self.scene.set_refresh_handler(self._changed.set)
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("States", icon=viser.Icon.BUG):
+            self._status = gui.add_markdown("")
+            self._step = gui.add_slider(
+                "Step", 0, max(len(dump.steps) - 1, 1), 1, len(dump.steps) - 1,
+                disabled=len(dump.steps) == 1, hint="Recorded substep; the last led to the NaN.",
+            )  # fmt: skip
+            self._env = gui.add_slider(
+                "Environment", 0, max(len(self._envs) - 1, 1), 1, 0,
+                visible=len(self._envs) > 1, hint="Which of the recorded environments.",
+            )  # fmt: skip
+            with gui.add_folder("Scene"):
+                self.scene.create_scene_gui(show_debug_viz_control=False)
+        with tabs.add_tab("Visualization", icon=viser.Icon.EYE):
+            self.scene.create_overlay_gui()
+        with tabs.add_tab("Groups", icon=viser.Icon.LAYERS_INTERSECT):
+            self.scene.create_groups_gui()
+        for slider in (self._step, self._env):
+            slider.on_update(lambda _: self._changed.set())
+        self.show()
+
+    @property
+    def status(self) -> str:
+        """The text above the controls."""
+        return self._status.content
+
+    def run(self) -> None:
+        """Show what is asked for, until Ctrl-C."""
+        while True:
+            if self._changed.wait(timeout=0.2):
+                self.show()
+
+    def show(self) -> None:
+        """Show the state that the sliders name."""
+        self._changed.clear()
+        index = min(int(self._step.value), len(self.dump.steps) - 1)
+        row = min(int(self._env.value), len(self._envs) - 1)
+        mujoco.mj_resetData(self.model, self.data)
+        self.dump.apply(self.dump.steps[index], row, self.model, self.data)
+        # MuJoCo refuses to compute from a state that is not finite; where bodies are is unknown.
+        is_finite = all(np.isfinite(getattr(self.data, name)).all() for name in ("qpos", "qvel"))
+        if is_finite:
+            mujoco.mj_forward(self.model, self.data)
+            if row != self._row_shown and self._looks_differ:
+                self.scene.rebuild_visual_handles()
+            self._row_shown = row
+            self.scene.update_from_mjdata(self.data)
+        self._status.content = self._describe(index, row)
+
+    def _describe(self, index: int, row: int) -> str:
+        metadata, env = self.dump.metadata, self._envs[row]
+        ids = metadata["nan_env_ids"]
+        shown = ", ".join(map(str, ids[:_SHOWN_ENVS])) + (" ..." if len(ids) > _SHOWN_ENVS else "")
+        lines = [
+            f"**Substep {self.dump.steps[index]}** ({index + 1} of {len(self.dump.steps)} recorded; "
+            f"NaN found after substep {metadata['detection_step'] - 1})",
+            f"**Environment {env}**: {'went NaN' if env in ids else 'clean'}",
+            f"Environments with NaN: {shown} ({len(ids)} of {metadata['num_envs_total']})",
+            *self._findings(),
+        ]
+        return "\n\n".join(lines)
+
+    def _findings(self) -> list[str]:
+        """Return what is not finite in the state, or else what is largest."""
+        bad = [name for name in _FIELDS if not np.isfinite(getattr(self.data, name)).all()]
+        if bad:
+            return [f"Not finite here: {', '.join(bad)}"]
+        if self.model.nv == 0:
+            return []
+        return [
+            f"Largest |{name}|: {_largest(self.model, getattr(self.data, name))}"
+            for name in ("qvel", "qacc")
+        ]
+
+
+def _largest(model: mujoco.MjModel, values: Any) -> str:
+    dof = int(np.abs(values).argmax())
+    joint = int(model.dof_jntid[dof])
+    name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"joint {joint}"
+    return f"{abs(values[dof]):.3g} ({name})"
 
 
 def main() -> None:
     """Entry point of `viz-nan`."""
-    run_command(_command)
+    run_alias("viz-nan")
 
 
 if __name__ == "__main__":

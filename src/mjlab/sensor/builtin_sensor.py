@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -10,33 +10,11 @@ import mujoco
 import torch
 
 from mjlab.sensor.sensor import Sensor, SensorCfg
-from mjlab.utils.string import name_list
+from mjlab.utils.errors import check_one_of
+from mjlab.utils.string import suggest
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
-
-
-# MERGED mjlab.sensor.builtin_sensor: Names in the scene of what an `ObjRef` refers to.
-
-
-# The scene attaches its terrain without a prefix.
-_TERRAIN = "terrain"
-
-
-def find_in_scene(ref: ObjRef, names: Iterable[str]) -> tuple[str | None, list[str]]:
-    """Look for what `ref` refers to among the `names` that elements of its kind have in the scene.
-
-    Returns its name in the scene, None if there is no such element; and the names that the owner
-    has to offer, without its prefix.
-    """
-    prefix = f"{ref.entity}/" if ref.entity else ""
-    offered = {name.removeprefix(prefix): name for name in names if name.startswith(prefix)}
-    if ref.entity == _TERRAIN:
-        # A name with a prefix belongs to another entity. Where there is no terrain, an entity may
-        # be called so, and has its prefix.
-        offered = {name: name for name in names if name and "/" not in name} | offered
-    offered.pop("", None)
-    return offered.get(ref.name), list(offered)
 
 
 ObjType = Literal["body", "xbody", "joint", "geom", "site", "actuator", "tendon", "camera"]
@@ -51,6 +29,10 @@ SensorType = Literal[
     "jointactfrc", "tendonactfrc", "actuatorpos", "actuatorvel", "actuatorfrc",
     "clock", "e_potential", "e_kinetic",
 ]  # fmt: skip
+
+# The scene attaches its terrain without a prefix.
+_TERRAIN = "terrain"
+
 _FRAME = ("body", "xbody", "geom", "site", "camera")
 
 # Kinds that MJCF and MuJoCo's headers name differently; both names are taken.
@@ -104,11 +86,7 @@ class BuiltinSensorCfg(SensorCfg):
     """Bound on the absolute value of the data; 0 for none."""
 
     def __post_init__(self) -> None:
-        if self.sensor_type not in get_args(SensorType):
-            raise ValueError(
-                f"Sensor {self.name!r}: sensor_type={self.sensor_type!r} is unknown. Choose from: "
-                f"{', '.join(get_args(SensorType))}."
-            )
+        check_one_of(f"Sensor {self.name!r} sensor_type", self.sensor_type, get_args(SensorType))
         allowed = next(v for start, v in _OBJECTS.items() if self.sensor_type.startswith(start))
         self._check(self.obj, "obj", allowed)
         if self.ref is not None:
@@ -186,12 +164,13 @@ class BuiltinSensor(Sensor[torch.Tensor]):
         sensor = scene_spec.add_sensor(
             name=name, type=getattr(mujoco.mjtSensor, f"mjSENS_{kind.upper()}")
         )
-        if cfg.obj is not None:
-            sensor.objname = _full_name(name, cfg.obj, scene_spec, entities)
-            sensor.objtype = _object_type(cfg.obj)
-        if cfg.ref is not None:
-            sensor.refname = _full_name(name, cfg.ref, scene_spec, entities)
-            sensor.reftype = _object_type(cfg.ref)
+        for ref, kind in ((cfg.obj, "obj"), (cfg.ref, "ref")):
+            if ref is not None:
+                check_entity(f"Sensor {name!r}", ref, entities)
+                elements = "bodies" if ref.type in ("body", "xbody") else f"{ref.type}s"
+                names = [element.name for element in getattr(scene_spec, elements)]
+                setattr(sensor, f"{kind}name", find_in_scene(f"Sensor {name!r}", ref, names))
+                setattr(sensor, f"{kind}type", getattr(mujoco.mjtObj, f"mjOBJ_{ref.type.upper()}"))
         if cfg.sensor_type == "rangefinder":
             # Of what a rangefinder can report, the distance alone.
             sensor.intprm[0] = 1 << int(mujoco.mjtRayDataField.mjRAYDATA_DIST)
@@ -212,23 +191,33 @@ class BuiltinSensor(Sensor[torch.Tensor]):
         return self._sensordata
 
 
-def _object_type(obj: ObjRef) -> mujoco.mjtObj:
-    return getattr(mujoco.mjtObj, f"mjOBJ_{obj.type.upper()}")
+def check_entity(owner: str, ref: ObjRef, entities: dict[str, Entity]) -> None:
+    """Raise `ValueError`, which opens with `owner`, unless the entity of `ref` exists."""
+    if ref.entity and ref.entity not in entities:
+        raise ValueError(f"{owner}: unknown entity {ref.entity!r}; {suggest(ref.entity, entities)}")
 
 
-def _full_name(sensor: str, obj: ObjRef, spec: mujoco.MjSpec, entities: dict[str, Entity]) -> str:
-    """Return the name in the scene of what `obj` refers to; ValueError if there is no such thing."""
-    if obj.entity and obj.entity not in entities:
+def find_in_scene(owner: str, ref: ObjRef, names: Sequence[str]) -> str:
+    """Return the name in the scene of the element that `ref` refers to.
+
+    Args:
+        owner: Start of the message.
+        ref: Reference to an element.
+        names: Names of all elements of its type in the scene.
+
+    Raises:
+        ValueError: the entity, or the scene, does not have the element.
+    """
+    prefix = f"{ref.entity}/" if ref.entity else ""
+    offered = {name.removeprefix(prefix): name for name in names if name.startswith(prefix)}
+    if ref.entity == _TERRAIN:
+        # A name with a prefix belongs to another entity. Where there is no terrain, an entity may
+        # be called so, and has its prefix.
+        offered = {name: name for name in names if name and "/" not in name} | offered
+    offered.pop("", None)
+    if ref.name not in offered:
+        where = f"entity {ref.entity!r}" if ref.entity else "the scene"
         raise ValueError(
-            f"Sensor {sensor!r} refers to the entity {obj.entity!r}. The scene has: "
-            f"{sorted(entities)}."
+            f"{owner}: unknown {ref.type} {ref.name!r} in {where}; {suggest(ref.name, offered)}"
         )
-    kind = "bodies" if obj.type in ("body", "xbody") else f"{obj.type}s"
-    full_name, offered = find_in_scene(obj, [element.name for element in getattr(spec, kind)])
-    if full_name is None:
-        raise ValueError(
-            f"Sensor {sensor!r} refers to the {obj.type} {obj.name!r}, which "
-            f"{f'entity {obj.entity!r}' if obj.entity else 'the scene'} does not have. It has: "
-            f"{name_list(offered, near=[obj.name])}."
-        )
-    return full_name
+    return offered[ref.name]

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -21,116 +20,18 @@ from mjlab.sim.engine import (
     Images,
     rendered_geoms,
 )
+from mjlab.utils.errors import WrongStateError, check_count, check_one_of
+from mjlab.utils.string import suggest
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
-    from mjlab.sensor.sensor_context import SensorContext
-
-
-# MERGED mjlab.sensor.camera_sensor: What can be wrong with the config of a camera sensor, and how a camera's projection is set.
-
-_MAX_FOVY = 180.0
-
-
-def check_camera_cfg(cfg: CameraSensorCfg) -> None:
-    """Raise ValueError for what is wrong with `cfg`, whatever the scene."""
-    for problem in (
-        _size_problem(cfg),
-        _data_problem(cfg),
-        _group_problem(cfg),
-        _lens_problem(cfg),
-    ):
-        if problem is not None:
-            raise ValueError(f"Camera sensor {cfg.name!r}: {problem}")
-
-
-def _size_problem(cfg: CameraSensorCfg) -> str | None:
-    for name in ("width", "height"):
-        value = getattr(cfg, name)
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            return (
-                f"{name} is {value!r}; an image has a whole number of pixels, at least 1 each way "
-                "(such as width=32, height=32)."
-            )
-    return None
-
-
-def _data_problem(cfg: CameraSensorCfg) -> str | None:
-    choice = f"Choose from: {', '.join(CAMERA_DATA_TYPES)}."
-    if isinstance(cfg.data_types, str):
-        return f"data_types is the string {cfg.data_types!r}; give a tuple. {choice}"
-    if not cfg.data_types:
-        return f"data_types is empty, so that the camera would measure nothing. {choice}"
-    unknown = [kind for kind in cfg.data_types if kind not in CAMERA_DATA_TYPES]
-    if unknown:
-        return f"data_types has {', '.join(map(repr, unknown))}, which is unknown. {choice}"
-    if len(set(cfg.data_types)) < len(cfg.data_types):
-        return f"data_types={cfg.data_types!r} names one of them twice."
-    return None
-
-
-def _group_problem(cfg: CameraSensorCfg) -> str | None:
-    known = f"Geom groups are 0 to {NUM_GEOM_GROUPS - 1}."
-    if not cfg.enabled_geom_groups:
-        return f"enabled_geom_groups is empty, so that the camera would see nothing. {known}"
-    unknown = [group for group in cfg.enabled_geom_groups if group not in range(NUM_GEOM_GROUPS)]
-    if unknown:
-        return f"enabled_geom_groups has {', '.join(map(str, unknown))}, which is unknown. {known}"
-    return None
-
-
-def _lens_problem(cfg: CameraSensorCfg) -> str | None:
-    if cfg.fovy is None:
-        return None
-    if not (cfg.fovy > 0.0 and math.isfinite(cfg.fovy)):
-        return f"fovy is {cfg.fovy}; it has to be positive and finite."
-    if not cfg.orthographic and cfg.camera_name is None and cfg.fovy >= _MAX_FOVY:
-        return f"fovy is {cfg.fovy}; a field of view is less than {_MAX_FOVY:g} degrees."
-    return None
-
-
-def find_camera(name: str, cameras: Sequence[str]) -> str:
-    """Return what to say about a camera `name` that is not among `cameras`."""
-    named = [camera for camera in cameras if camera]
-    close = difflib.get_close_matches(name, named, n=1, cutoff=0.5)
-    hint = f" Did you mean {close[0]!r}?" if close else ""
-    offered = f"The scene has: {', '.join(sorted(named))}." if named else "The scene has no camera."
-    return (
-        f"there is no camera {name!r}. Names have the prefix of their entity, such as "
-        f"'robot/wrist'. {offered}{hint}"
-    )
-
-
-def set_field_of_view(camera: mujoco.MjsCamera, fovy: float | None, *, orthographic: bool) -> None:
-    """Change the projection of a camera; None and False leave it as it is."""
-    if orthographic:
-        camera.proj = mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC
-    if fovy is not None:
-        camera.fovy = fovy
-        # The compiler ignores the field of view of a camera that has a sensor.
-        camera.sensor_size = [0.0, 0.0]
-        camera.focal_length, camera.focal_pixel = [0.0, 0.0], [0.0, 0.0]
-        camera.principal_length, camera.principal_pixel = [0.0, 0.0], [0.0, 0.0]
-
-
-def check_shared_cameras(sensors: Sequence[CameraSensor]) -> None:
-    """Raise ValueError if sensors want one camera to have several projections."""
-    first: dict[str, CameraSensor] = {}
-    for sensor in sensors:
-        other = first.setdefault(sensor.camera_name, sensor)
-        for field in ("fovy", "orthographic"):
-            values = getattr(other.cfg, field), getattr(sensor.cfg, field)
-            if values[0] != values[1]:
-                raise ValueError(
-                    f"Camera sensors {other.cfg.name!r} and {sensor.cfg.name!r} look through the "
-                    f"camera {sensor.camera_name!r}, but {field} is {values[0]!r} for the one and "
-                    f"{values[1]!r} for the other. Give both the same, or one a camera of its own "
-                    "(camera_name=None, with parent_body, pos and quat)."
-                )
 
 
 log = logging.getLogger(__name__)
+
+# Fields of view of perspective cameras, in degrees.
 _DEFAULT_FOVY = 45.0
+_MAX_FOVY = 180.0
 
 
 @dataclass
@@ -195,8 +96,8 @@ class CameraSensor(Sensor[CameraSensorData]):
     Images are rendered by `sim.sense()`: once per environment step, after resets and commands. So
     observations see the current state, and rewards and terminations the images of the step before.
 
-    A camera sees surfaces from outside only, and no geom with an alpha of 0; others are opaque. Several sensors may look
-    through one camera, with images of other sizes and of other geom groups.
+    A camera sees surfaces from outside only, and no geom with an alpha of 0; others are opaque.
+    Several sensors may look through one camera, with images of other sizes and of other geom groups.
     """
 
     _transient = {"_camera_idx", "_view"}
@@ -210,15 +111,47 @@ class CameraSensor(Sensor[CameraSensorData]):
         """
         super().__init__()
         self.cfg = cfg
-        check_camera_cfg(cfg)
+        self._check_cfg()
         self._camera_idx = -1
         self._view: CameraView | None = None
         self._rgb: torch.Tensor | None = None
         self._depth: torch.Tensor | None = None
         self._segmentation: torch.Tensor | None = None
 
+    def _check_cfg(self) -> None:
+        cfg, owner = self.cfg, f"Camera sensor {self.cfg.name!r}"
+        check_count(f"{owner} width", cfg.width)
+        check_count(f"{owner} height", cfg.height)
+        if isinstance(cfg.data_types, str) or not cfg.data_types:
+            raise ValueError(
+                f"{owner} data_types: expected a tuple of {', '.join(CAMERA_DATA_TYPES)}, got "
+                f"{cfg.data_types!r}."
+            )
+        for kind in cfg.data_types:
+            check_one_of(f"{owner} data_types", kind, CAMERA_DATA_TYPES)
+        if len(set(cfg.data_types)) < len(cfg.data_types):
+            raise ValueError(f"{owner} data_types={cfg.data_types!r} names one of them twice.")
+        groups = range(NUM_GEOM_GROUPS)
+        if not cfg.enabled_geom_groups:
+            raise ValueError(
+                f"{owner} enabled_geom_groups is empty, so that the camera would see nothing; give "
+                f"some of {list(groups)}."
+            )
+        for group in cfg.enabled_geom_groups:
+            check_one_of(f"{owner} enabled_geom_groups", group, groups)
+        is_perspective = not cfg.orthographic and cfg.camera_name is None
+        limit = _MAX_FOVY if is_perspective else math.inf
+        if cfg.fovy is not None and not 0.0 < cfg.fovy < limit:
+            raise ValueError(f"{owner} fovy: expected a number in (0, {limit:g}), got {cfg.fovy}.")
+
     def _error(self, message: str) -> ValueError:
         return ValueError(f"Camera sensor {self.cfg.name!r}: {message}")
+
+    def _unknown_camera(self, name: str, cameras: Iterable[str]) -> ValueError:
+        return self._error(
+            f"unknown camera {name!r} (names have the prefix of their entity, such as "
+            f"'robot/wrist'); {suggest(name, filter(None, cameras))}"
+        )
 
     # Construction.
 
@@ -242,8 +175,8 @@ class CameraSensor(Sensor[CameraSensorData]):
             camera = scene_spec.camera(cfg.camera_name)
             if camera is None:
                 names = [camera.name for camera in scene_spec.cameras]
-                raise self._error(find_camera(cfg.camera_name, names))
-            set_field_of_view(camera, cfg.fovy, orthographic=cfg.orthographic)
+                raise self._unknown_camera(cfg.camera_name, names)
+            _set_projection(camera, cfg.fovy, orthographic=cfg.orthographic)
 
     def _add_camera(self, scene_spec: mujoco.MjSpec) -> None:
         cfg = self.cfg
@@ -251,10 +184,10 @@ class CameraSensor(Sensor[CameraSensorData]):
         if cfg.parent_body is not None:
             body = scene_spec.body(cfg.parent_body)
             if body is None:
-                names = ", ".join(sorted(body.name for body in scene_spec.bodies))
+                names = [body.name for body in scene_spec.bodies]
                 raise self._error(
-                    f"there is no body {cfg.parent_body!r} to carry the camera. Names have the prefix "
-                    f"of their entity. The scene has: {names}."
+                    f"unknown body {cfg.parent_body!r} (names have the prefix of their entity); "
+                    f"{suggest(cfg.parent_body, names)}"
                 )
         if scene_spec.camera(cfg.name) is not None:
             raise self._error(
@@ -264,7 +197,7 @@ class CameraSensor(Sensor[CameraSensorData]):
         camera = body.add_camera(name=cfg.name, pos=cfg.pos, quat=cfg.quat)
         camera.resolution = [cfg.width, cfg.height]
         fovy = _DEFAULT_FOVY if cfg.fovy is None else cfg.fovy
-        set_field_of_view(camera, fovy, orthographic=cfg.orthographic)
+        _set_projection(camera, fovy, orthographic=cfg.orthographic)
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
         """Find the camera in the compiled model; its images are empty until `sim.sense()`.
@@ -276,7 +209,7 @@ class CameraSensor(Sensor[CameraSensorData]):
         self._camera_idx = mujoco.mj_name2id(mj_model, kind, self.camera_name)
         if self._camera_idx < 0:
             names = [mujoco.mj_id2name(mj_model, kind, i) or "" for i in range(mj_model.ncam)]
-            raise self._error(find_camera(self.camera_name, names))
+            raise self._unknown_camera(self.camera_name, names)
         cfg = self.cfg
         groups = tuple(sorted(set(cfg.enabled_geom_groups)))
         if not rendered_geoms(mj_model, groups):
@@ -297,7 +230,7 @@ class CameraSensor(Sensor[CameraSensorData]):
         )
         self.set_images(Images.empty(self._view, data.qpos.shape[0], device))
 
-    def set_context(self, ctx: SensorContext) -> None:
+    def set_context(self, ctx: object) -> None:
         """Take note of what will evaluate the sensor; the sensor needs nothing of it."""
 
     # What there is.
@@ -320,7 +253,7 @@ class CameraSensor(Sensor[CameraSensorData]):
             RuntimeError: the sensor is not initialized.
         """
         if self._view is None:
-            raise RuntimeError(f"Camera sensor {self.cfg.name!r} has not been initialized.")
+            raise WrongStateError(f"Camera sensor {self.cfg.name!r} has not been initialized.")
         return self._view
 
     # Sensing.
@@ -347,3 +280,15 @@ class CameraSensor(Sensor[CameraSensorData]):
         if self.cfg.clone_data:
             images = tuple(None if image is None else image.clone() for image in images)
         return CameraSensorData(*images)
+
+
+def _set_projection(camera: mujoco.MjsCamera, fovy: float | None, *, orthographic: bool) -> None:
+    """Change the projection of a camera; None and False leave it as it is."""
+    if orthographic:
+        camera.proj = mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC
+    if fovy is not None:
+        camera.fovy = fovy
+        # The compiler ignores the field of view of a camera that has a sensor.
+        camera.sensor_size = [0.0, 0.0]
+        camera.focal_length, camera.focal_pixel = [0.0, 0.0], [0.0, 0.0]
+        camera.principal_length, camera.principal_pixel = [0.0, 0.0], [0.0, 0.0]

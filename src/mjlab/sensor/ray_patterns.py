@@ -1,18 +1,18 @@
-"""TODO."""
+"""Ray patterns: origins and directions of the rays of one frame.
+
+A pattern gives offsets (n, 3) in metres and unit directions (n, 3), both in the aligned frame of a
+ray sensor.
+"""
 
 from __future__ import annotations
 
-import difflib
 import math
 from dataclasses import dataclass
 
 import mujoco
 import torch
 
-# MERGED mjlab.sensor.ray_patterns: Ray patterns: where the rays of one frame start, and where they point.
-#
-# A pattern gives offsets (n, 3) in metres and unit directions (n, 3), both in the aligned frame of a
-# ray sensor.
+from mjlab.utils.errors import check_exists, check_field, check_fields_positive
 
 Rays = tuple[torch.Tensor, torch.Tensor]
 """Offsets (n, 3) and unit directions (n, 3) in the aligned frame."""
@@ -40,24 +40,18 @@ class GridPatternCfg:
         Raises:
             ValueError: a resolution that is not positive, a negative size, no direction.
         """
-        if not (self.resolution > 0.0 and math.isfinite(self.resolution)):
-            raise ValueError(
-                f"GridPatternCfg.resolution is {self.resolution}; it has to be positive (metres)."
-            )
-        if not all(side >= 0.0 and math.isfinite(side) for side in self.size):
-            raise ValueError(
-                f"GridPatternCfg.size is {self.size}; both have to be 0 or more (metres)."
-            )
-        x, y = (self._positions(side, device) for side in self.size)
-        grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
+        check_fields_positive(self, "resolution")
+        is_extent = all(side >= 0.0 and math.isfinite(side) for side in self.size)
+        check_field(self, "size", is_extent, "lengths >= 0 m")
+        axes = []
+        for side in self.size:
+            # All k with k d < side + d / 2. The margin keeps rounding from adding a ray.
+            count = max(1, math.ceil(side / self.resolution + 0.5 - 1e-9))
+            steps = torch.arange(count, dtype=torch.float64) * self.resolution - side / 2
+            axes.append(steps.to(device, torch.float32))
+        grid_y, grid_x = torch.meshgrid(axes[1], axes[0], indexing="ij")
         offsets = torch.stack((grid_x, grid_y, torch.zeros_like(grid_x)), dim=-1).flatten(0, 1)
         return offsets, _parallel(self.direction, len(offsets), "GridPatternCfg", device)
-
-    def _positions(self, side: float, device: str) -> torch.Tensor:
-        # All k with k d < side + d / 2. The margin keeps rounding from adding a ray.
-        count = max(1, math.ceil(side / self.resolution + 0.5 - 1e-9))
-        steps = torch.arange(count, dtype=torch.float64) * self.resolution - side / 2
-        return steps.to(device, torch.float32)
 
 
 @dataclass
@@ -112,8 +106,7 @@ class PinholeCameraPatternCfg:
         width, height, half_x, half_y, centre = self._image_plane(mj_model)
         if width < 1 or height < 1:
             raise ValueError(
-                f"PinholeCameraPatternCfg has {width} x {height} pixels, so no rays; give a width "
-                "and a height of at least 1."
+                f"PinholeCameraPatternCfg: expected at least 1 x 1 pixels, got {width} x {height}."
             )
         u = (torch.arange(width, dtype=torch.float64) + 0.5) * 2.0 / width - 1.0
         v = 1.0 - (torch.arange(height, dtype=torch.float64) + 0.5) * 2.0 / height
@@ -134,7 +127,9 @@ class PinholeCameraPatternCfg:
             raise ValueError(
                 f"The pattern of the camera {self._camera_name!r} needs the compiled model."
             )
-        camera = find_camera(mj_model, self._camera_name)
+        names = [mj_model.camera(i).name for i in range(mj_model.ncam)]
+        check_exists("camera", self._camera_name, names)
+        camera = names.index(self._camera_name)
         width, height = (int(value) for value in mj_model.cam_resolution[camera])
         sensor = mj_model.cam_sensorsize[camera]
         if sensor[1] == 0.0:
@@ -205,19 +200,6 @@ class RingPatternCfg:
 
 
 PatternCfg = GridPatternCfg | PinholeCameraPatternCfg | RingPatternCfg
-
-
-def find_camera(mj_model: mujoco.MjModel, name: str) -> int:
-    """Return the id of the camera `name`; ValueError with close names if there is none."""
-    camera = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, name)
-    if camera < 0:
-        names = [mj_model.camera(i).name for i in range(mj_model.ncam)]
-        close = difflib.get_close_matches(name, names, n=3) or names
-        raise ValueError(
-            f"There is no camera {name!r}. "
-            + (f"The scene has: {', '.join(close)}." if close else "The scene has no cameras.")
-        )
-    return camera
 
 
 def _parallel(direction: tuple[float, ...], count: int, owner: str, device: str) -> torch.Tensor:

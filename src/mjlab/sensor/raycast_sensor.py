@@ -1,8 +1,10 @@
-"""Ray sensors: distances to what surrounds a frame, along a pattern of rays."""
+"""Ray sensors: distances from frames to surrounding geometry, along a pattern of rays.
+
+Data has N environments, F frames and n rays per frame; ray `f n + r` is ray r of frame f.
+"""
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,7 +14,7 @@ import mujoco
 import torch
 
 from mjlab.compat import older_names
-from mjlab.sensor.builtin_sensor import ObjRef, find_in_scene
+from mjlab.sensor.builtin_sensor import ObjRef, check_entity, find_in_scene
 from mjlab.sensor.ray_patterns import (
     GridPatternCfg,
     PatternCfg,
@@ -20,171 +22,91 @@ from mjlab.sensor.ray_patterns import (
     RingPatternCfg,
 )
 from mjlab.sensor.sensor import Sensor, SensorCfg
+from mjlab.sim.engine import NUM_GEOM_GROUPS
+from mjlab.utils.errors import check_one_of
 from mjlab.utils.lab_api.math import quat_from_matrix
-from mjlab.utils.string import name_list
 
 if TYPE_CHECKING:
-    import torch
-
     from mjlab.entity import Entity
-    from mjlab.sensor.sensor_context import SensorContext
     from mjlab.viewer.debug_visualizer import DebugVisualizer
 
+__all__ = [
+    "GridPatternCfg",
+    "PatternCfg",
+    "PinholeCameraPatternCfg",
+    "RayAlignment",
+    "RayCastData",
+    "RayCastSensor",
+    "RayCastSensorCfg",
+    "RingPatternCfg",
+]
 
-# MERGED mjlab.sensor.raycast_sensor: Frames of the scene that a sensor is attached to: bodies, sites and geoms.
+RayAlignment = Literal["base", "yaw", "world"]
+"""Rotation of rays with their frame: full, about the vertical only, or none."""
 
+Color = tuple[float, float, float, float]
+_RAY_WIDTH = 0.1
 
-# Kind of frame: fields of MjData with position and orientation, and MuJoCo's type of the object.
-_KINDS = {
+# Frame types: fields of MjData with position and orientation, and MuJoCo's object type.
+_FRAMES = {
     "body": ("xpos", "xmat", mujoco.mjtObj.mjOBJ_BODY),
     "site": ("site_xpos", "site_xmat", mujoco.mjtObj.mjOBJ_SITE),
     "geom": ("geom_xpos", "geom_xmat", mujoco.mjtObj.mjOBJ_GEOM),
 }
-
-
-def check_frames(frames: tuple[ObjRef, ...], entities: dict[str, Entity]) -> None:
-    """Raise ValueError unless all `frames` are bodies, sites or geoms, of entities there are."""
-    if not frames:
-        raise ValueError("frame is empty; give one ObjRef or several.")
-    for frame in frames:
-        if frame.type not in _KINDS:
-            raise ValueError(
-                f"frame {frame.name!r} is of type {frame.type!r}; rays start at a body, a site or "
-                "a geom."
-            )
-        if frame.entity and frame.entity not in entities:
-            raise ValueError(
-                f"frame {frame.name!r} refers to the entity {frame.entity!r}. The scene has: "
-                f"{sorted(entities)}."
-            )
-
-
-def _find(frame: ObjRef, mj_model: mujoco.MjModel) -> int:
-    """Return the id of a frame; ValueError with close names if there is none."""
-    kind = _KINDS[frame.type][2]
-    names = [
-        mujoco.mj_id2name(mj_model, kind, i) or ""
-        for i in range(getattr(mj_model, f"n{frame.type}"))
-    ]
-    full_name, offered = find_in_scene(frame, names)
-    if full_name is not None:
-        return names.index(full_name)
-    close = difflib.get_close_matches(frame.name, offered, n=3)
-    hint = f"Close names: {', '.join(close)}." if close else f"It has: {name_list(offered, [])}."
-    owner = f"Entity {frame.entity!r}" if frame.entity else "The scene"
-    raise ValueError(f"{owner} has no {frame.type} {frame.name!r}. {hint}")
-
-
-class Frames:
-    """Poses of several frames, in the order in which they were given."""
-
-    def __init__(
-        self, frames: tuple[ObjRef, ...], mj_model: mujoco.MjModel, data: Any, device: str
-    ) -> None:
-        """Find the frames; ValueError with close names for one that does not exist."""
-        self._data = data
-        self._parts: list[tuple[str, str, torch.Tensor, torch.Tensor]] = []
-        self.body_ids: list[int] = []
-        """The body that carries each frame."""
-        ids = []
-        for frame in frames:
-            index = _find(frame, mj_model)
-            ids.append(index)
-            owners = {"site": mj_model.site_bodyid, "geom": mj_model.geom_bodyid}
-            self.body_ids.append(index if frame.type == "body" else int(owners[frame.type][index]))
-        for kind in dict.fromkeys(frame.type for frame in frames):
-            places = [i for i, frame in enumerate(frames) if frame.type == kind]
-            self._parts.append(
-                (
-                    *_KINDS[kind][:2],
-                    torch.tensor(places, device=device),
-                    torch.tensor([ids[i] for i in places], device=device),
-                )
-            )
-
-    def read(self, pos: torch.Tensor, mat: torch.Tensor) -> None:
-        """Copy current positions into `pos` (N, F, 3) and orientations into `mat` (N, F, 3, 3)."""
-        for pos_field, mat_field, places, ids in self._parts:
-            for out, source in ((pos, pos_field), (mat, mat_field)):
-                values = getattr(self._data, source).index_select(1, ids)
-                if len(self._parts) == 1:
-                    out.copy_(values)
-                else:
-                    out.index_copy_(1, places, values)
-
-
-# MERGED mjlab.sensor.raycast_sensor: Rotating the rays of a frame into the world.
-
-RayAlignment = Literal["base", "yaw", "world"]
-"""How rays turn with their frame: fully, about the vertical only, or not at all."""
 
 # Below this horizontal length of the frame's x axis, its y axis says where the frame points.
 _STEEP = 0.1
 _TINY = 1e-12
 
 
-def heading(mat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return cosine and sine of the yaw (...,) of rotation matrices (..., 3, 3).
+@dataclass
+class VizCfg:
+    """How rays are drawn. Lengths are multiples of the model's mean size, colours RGBA."""
 
-    The direction is that of the horizontal projection of the frame's x axis. Where the x axis is
-    nearly vertical (projection shorter than 0.1), it is the projection (a, b) of the y axis turned
-    back by a quarter: (b, -a).
-    """
-    # By components: an operation over a last dimension of two takes a CPU ten times as long.
-    x, y = mat[..., 0, 0], mat[..., 1, 0]
-    is_steep = x * x + y * y < _STEEP**2
-    x = torch.where(is_steep, mat[..., 1, 1], x)
-    y = torch.where(is_steep, -mat[..., 0, 1], y)
-    length = (x * x + y * y).sqrt_().clamp_(min=_TINY)
-    return x / length, y / length
-
-
-def is_constant(vectors: torch.Tensor, alignment: RayAlignment) -> bool:
-    """Return whether vectors (n, 3) of the aligned frame point the same way in every pose."""
-    if alignment == "world":
-        return True
-    return alignment == "yaw" and bool((vectors[:, :2] == 0.0).all())
-
-
-def rotate_into(
-    out: torch.Tensor,
-    vectors: torch.Tensor,
-    mat: torch.Tensor,
-    alignment: RayAlignment,
-    start: torch.Tensor | None = None,
-) -> None:
-    """Write `start + A vectors` into `out`, with A the aligned orientation of each frame.
-
-    Column by column, because every column is one operation over all environments and rays, and
-    without a matrix product, which a GPU may round to TF32: centimetres, far from the origin.
-
-    Args:
-        out: (N, F, n, 3).
-        vectors: (n, 3) in the aligned frame.
-        mat: (N, F, 3, 3) orientations of the frames.
-        alignment: Which part of the orientation counts.
-        start: (N, F, 3) world positions; None for none.
-    """
-    x, y, z = vectors.unbind(-1)
-    if alignment == "yaw":
-        cosine, sine = (part[..., None] for part in heading(mat))
-        turn = (cosine, -sine), (sine, cosine)
-    else:
-        turn = ()
-    for axis, column in enumerate(out.unbind(-1)):
-        if alignment == "base":
-            first, second, third = mat[..., axis, :, None].unbind(-2)
-            part = (first * x).addcmul_(second, y).addcmul_(third, z)
-        elif alignment == "world" or axis == 2:
-            part = vectors[:, axis].expand_as(column)
-        else:
-            first, second = turn[axis]
-            part = (first * x).addcmul_(second, y)
-        # The start comes last: far from the origin, sums with it are rounded most.
-        torch.add(part, 0.0 if start is None else start[..., axis, None], out=column)
+    hit_color: Color = (0.0, 1.0, 0.0, 0.8)
+    """Colour of rays that hit something."""
+    miss_color: Color = (1.0, 0.0, 0.0, 0.4)
+    """Colour of rays that hit nothing."""
+    hit_sphere_color: Color = (0.0, 1.0, 1.0, 1.0)
+    """Colour of the spheres at the points that are hit."""
+    hit_sphere_radius: float = 0.5
+    """Radius of these spheres."""
+    show_rays: bool = False
+    """Whether to draw the rays as arrows."""
+    show_normals: bool = False
+    """Whether to draw surface normals at the points that are hit."""
+    normal_color: Color = (1.0, 1.0, 0.0, 1.0)
+    """Colour of the normals."""
+    normal_length: float = 5.0
+    """Length of the normals."""
 
 
-# MERGED mjlab.sensor.raycast_sensor: What a ray sensor has measured.
+@dataclass
+class RayCastSensorCfg(SensorCfg):
+    """Describes a ray sensor."""
+
+    VizCfg = VizCfg
+
+    frame: ObjRef | tuple[ObjRef, ...]
+    """Body, site or geom from which the pattern is cast; or several, also of several entities."""
+    pattern: PatternCfg = field(default_factory=GridPatternCfg)
+    """The rays of each frame."""
+    ray_alignment: RayAlignment = "base"
+    """How the pattern turns with its frame: `base` fully, `yaw` about the vertical, `world` not."""
+    max_distance: float = 10.0
+    """Reach of the rays, in metres. What lies beyond is a miss."""
+    exclude_parent_body: bool = True
+    """Whether the geoms of the body that carries the frame (of that body alone) are invisible."""
+    include_geom_groups: tuple[int, ...] | None = (0, 1, 2)
+    """Geom groups, 0 to 5, that are visible; None for all."""
+    debug_vis: bool = False
+    """Whether viewers draw the rays."""
+    viz: VizCfg = field(default_factory=VizCfg)
+    """How they draw them."""
+
+    def build(self) -> RayCastSensor:
+        """Build the sensor."""
+        return RayCastSensor(self)
 
 
 @dataclass
@@ -225,121 +147,6 @@ class RayCastData:
         return self.__dict__[name]
 
 
-# MERGED mjlab.sensor.raycast_sensor: Drawing what a ray sensor sees.
-
-Color = tuple[float, float, float, float]
-_RAY_WIDTH = 0.1
-
-
-@dataclass
-class VizCfg:
-    """How rays are drawn. Lengths are multiples of the model's mean size, colours RGBA."""
-
-    hit_color: Color = (0.0, 1.0, 0.0, 0.8)
-    """Colour of rays that hit something."""
-    miss_color: Color = (1.0, 0.0, 0.0, 0.4)
-    """Colour of rays that hit nothing."""
-    hit_sphere_color: Color = (0.0, 1.0, 1.0, 1.0)
-    """Colour of the spheres at the points that are hit."""
-    hit_sphere_radius: float = 0.5
-    """Radius of these spheres."""
-    show_rays: bool = False
-    """Whether to draw the rays as arrows."""
-    show_normals: bool = False
-    """Whether to draw surface normals at the points that are hit."""
-    normal_color: Color = (1.0, 1.0, 0.0, 1.0)
-    """Colour of the normals."""
-    normal_length: float = 5.0
-    """Length of the normals."""
-
-
-def draw_rays(
-    visualizer: DebugVisualizer,
-    name: str,
-    viz: VizCfg,
-    max_distance: float,
-    rays: dict[str, torch.Tensor],
-) -> None:
-    """Draw the rays of the environments in view.
-
-    Args:
-        visualizer: What to draw into.
-        name: Name of the sensor, for the labels.
-        viz: Colours and sizes.
-        max_distance: Reach of the rays (m); a miss is drawn `min(0.5, 0.05 max_distance)` long.
-        rays: `origins`, `directions`, `hits`, `normals` (N, R, 3) and `distances` (N, R).
-    """
-    size = visualizer.meansize
-    miss_length = min(0.5, 0.05 * max_distance)
-    for env in visualizer.get_env_indices(rays["distances"].shape[0]):
-        origins, directions, hits, normals, distances = (
-            rays[key][env].detach().cpu().double().numpy()
-            for key in ("origins", "directions", "hits", "normals", "distances")
-        )
-        for i, distance in enumerate(distances):
-            hit = distance >= 0.0
-            end = hits[i] if hit else origins[i] + miss_length * directions[i]
-            if viz.show_rays:
-                color = viz.hit_color if hit else viz.miss_color
-                visualizer.add_arrow(
-                    origins[i], end, color, width=_RAY_WIDTH * size, label=f"{name}_ray_{i}"
-                )
-            if not hit:
-                continue
-            visualizer.add_sphere(
-                end, viz.hit_sphere_radius * size, viz.hit_sphere_color, label=f"{name}_hit_{i}"
-            )
-            if viz.show_normals:
-                visualizer.add_arrow(
-                    end,
-                    end + viz.normal_length * size * normals[i],
-                    viz.normal_color,
-                    width=_RAY_WIDTH * size,
-                    label=f"{name}_normal_{i}",
-                )
-
-
-__all__ = [
-    "GridPatternCfg",
-    "PatternCfg",
-    "PinholeCameraPatternCfg",
-    "RayAlignment",
-    "RayCastData",
-    "RayCastSensor",
-    "RayCastSensorCfg",
-    "RingPatternCfg",
-]
-NUM_GEOM_GROUPS = 6
-
-
-@dataclass
-class RayCastSensorCfg(SensorCfg):
-    """Describes a ray sensor."""
-
-    VizCfg = VizCfg
-
-    frame: ObjRef | tuple[ObjRef, ...]
-    """Body, site or geom from which the pattern is cast; or several, also of several entities."""
-    pattern: PatternCfg = field(default_factory=GridPatternCfg)
-    """The rays of each frame."""
-    ray_alignment: RayAlignment = "base"
-    """How the pattern turns with its frame: `base` fully, `yaw` about the vertical, `world` not."""
-    max_distance: float = 10.0
-    """Reach of the rays, in metres. What lies beyond is a miss."""
-    exclude_parent_body: bool = True
-    """Whether the geoms of the body that carries the frame (of that body alone) are invisible."""
-    include_geom_groups: tuple[int, ...] | None = (0, 1, 2)
-    """Geom groups, 0 to 5, that are visible; None for all."""
-    debug_vis: bool = False
-    """Whether viewers draw the rays."""
-    viz: VizCfg = field(default_factory=VizCfg)
-    """How they draw them."""
-
-    def build(self) -> RayCastSensor:
-        """Build the sensor."""
-        return RayCastSensor(self)
-
-
 class RayCastSensor(Sensor[RayCastData]):
     """Casts a pattern of rays from one or several frames.
 
@@ -361,25 +168,18 @@ class RayCastSensor(Sensor[RayCastData]):
         """
         super().__init__()
         self.cfg = cfg
-        if cfg.ray_alignment not in get_args(RayAlignment):
-            raise self._error(
-                f"ray_alignment={cfg.ray_alignment!r} is unknown. Choose from: "
-                f"{', '.join(get_args(RayAlignment))}."
+        owner = f"Ray sensor {cfg.name!r}"
+        check_one_of(f"{owner} ray_alignment", cfg.ray_alignment, get_args(RayAlignment))
+        if not 0.0 < cfg.max_distance < math.inf:
+            raise ValueError(
+                f"{owner} max_distance: expected a finite length > 0 (m), got {cfg.max_distance}."
             )
-        if not (cfg.max_distance > 0.0 and math.isfinite(cfg.max_distance)):
-            raise self._error(
-                f"max_distance is {cfg.max_distance}; it has to be positive and finite (metres)."
-            )
-        wrong = [g for g in cfg.include_geom_groups or () if g not in range(NUM_GEOM_GROUPS)]
-        if wrong:
-            raise self._error(
-                f"include_geom_groups has {wrong}; geom groups are 0 to {NUM_GEOM_GROUPS - 1}, and "
-                "None includes all."
-            )
+        for group in cfg.include_geom_groups or ():
+            check_one_of(f"{owner} include_geom_groups", group, range(NUM_GEOM_GROUPS))
         if cfg.include_geom_groups is not None and not cfg.include_geom_groups:
-            raise self._error(
-                "include_geom_groups is empty, so that no ray could hit anything; None includes "
-                "all groups."
+            raise ValueError(
+                f"{owner} include_geom_groups is empty, so that no ray could hit anything; None "
+                "includes all groups."
             )
         frame = cfg.frame
         self._frame_refs = (frame,) if isinstance(frame, ObjRef) else tuple(frame)
@@ -397,10 +197,12 @@ class RayCastSensor(Sensor[RayCastData]):
             ValueError: no frame, one that is no body, site or geom, or one of an entity that does
                 not exist.
         """
-        try:
-            check_frames(self._frame_refs, entities)
-        except ValueError as error:
-            raise self._error(str(error)) from error
+        if not self._frame_refs:
+            raise self._error("frame is empty; give one ObjRef or several.")
+        for frame in self._frame_refs:
+            owner = f"Ray sensor {self.cfg.name!r} frame {frame.name!r}"
+            check_one_of(f"{owner} type", frame.type, _FRAMES)
+            check_entity(owner, frame, entities)
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
         """Generate the rays and find the frames in the compiled model.
@@ -411,14 +213,16 @@ class RayCastSensor(Sensor[RayCastData]):
         """
         try:
             offsets, directions = self.cfg.pattern.generate_rays(mj_model, device)
-            self._frames = Frames(self._frame_refs, mj_model, data, device)
+            self._frames = _Frames(self._frame_refs, mj_model, data, device)
         except ValueError as error:
             raise self._error(str(error)) from error
         if len(offsets) == 0:
             raise self._error("its pattern has no rays.")
         self._offsets, self._local_directions = offsets, directions
         self._num_rays_per_frame = len(offsets)
-        self._moving_directions = not is_constant(directions, self.cfg.ray_alignment)
+        # Vertical rays keep their directions under a rotation about the vertical.
+        alignment, is_vertical = self.cfg.ray_alignment, bool((directions[:, :2] == 0.0).all())
+        self._moving_directions = alignment == "base" or (alignment == "yaw" and not is_vertical)
         shape = (data.qpos.shape[0], self.num_frames)
         self._frame_pos = torch.zeros(*shape, 3, dtype=torch.float32, device=device)
         self._frame_mat = torch.eye(3, dtype=torch.float32, device=device).repeat(*shape, 1, 1)
@@ -440,7 +244,7 @@ class RayCastSensor(Sensor[RayCastData]):
         if not self._moving_directions:
             directions.copy_(self._local_directions.repeat(self.num_frames, 1))
 
-    def set_context(self, ctx: SensorContext) -> None:
+    def set_context(self, ctx: object) -> None:
         """Take note of what will evaluate the sensor; the sensor needs nothing of it."""
 
     # What there is.
@@ -490,22 +294,16 @@ class RayCastSensor(Sensor[RayCastData]):
         pos, mat = self._frame_pos, self._frame_mat
         self._frames.read(pos, mat)
         shape = (self.num_frames, self.num_rays_per_frame)
-        rotate_into(self._origins.unflatten(1, shape), self._offsets, mat, alignment, pos)
+        _rotate_into(self._origins.unflatten(1, shape), self._offsets, mat, alignment, pos)
         if self._moving_directions:
             rays = self._directions.unflatten(1, shape)
-            rotate_into(rays, self._local_directions, mat, alignment)
+            _rotate_into(rays, self._local_directions, mat, alignment)
 
     def raycast_kernel(self, rc: Callable[..., tuple[torch.Tensor, ...]]) -> None:
         """Cast the prepared rays of this sensor alone, by `rc`: `Simulation.raycast`."""
-        reach = torch.full(
-            (self.num_rays,),
-            self.cfg.max_distance,
-            dtype=torch.float32,
-            device=self._origins.device,
-        )
-        excluded = torch.tensor(
-            self.excluded_bodies, dtype=torch.int32, device=self._origins.device
-        )
+        device, reach = self._origins.device, [self.cfg.max_distance] * self.num_rays
+        reach = torch.tensor(reach, dtype=torch.float32, device=device)
+        excluded = torch.tensor(self.excluded_bodies, dtype=torch.int32, device=device)
         distances, normals, _ = rc(
             self._origins, self._directions, self.include_geom_groups, excluded, reach
         )
@@ -541,18 +339,133 @@ class RayCastSensor(Sensor[RayCastData]):
         return self.cfg.debug_vis
 
     def debug_vis(self, visualizer: DebugVisualizer) -> None:
-        """Draw the points that are hit, and rays and normals if the config says so."""
+        """Draw the points that are hit, and rays and normals if the config says so.
+
+        A ray that misses is drawn `min(0.5, 0.05 max_distance)` long, in metres.
+        """
         if not self.cfg.debug_vis:
             return
+        viz, name, size = self.cfg.viz, self.cfg.name, visualizer.meansize
+        miss_length = min(0.5, 0.05 * self.cfg.max_distance)
         data = self.data
-        rays = {
-            "origins": self._origins,
-            "directions": self._directions,
-            "hits": data.hit_pos_w,
-            "normals": data.normals_w,
-            "distances": data.distances,
-        }
-        draw_rays(visualizer, self.cfg.name, self.cfg.viz, self.cfg.max_distance, rays)
+        rays = (self._origins, self._directions, data.hit_pos_w, data.normals_w, data.distances)
+        for env in visualizer.get_env_indices(data.distances.shape[0]):
+            of_env = (values[env].detach().cpu().double().numpy() for values in rays)
+            for i, (origin, direction, hit_pos, normal, distance) in enumerate(
+                zip(*of_env, strict=True)
+            ):
+                hit = distance >= 0.0
+                end = hit_pos if hit else origin + miss_length * direction
+                if viz.show_rays:
+                    color = viz.hit_color if hit else viz.miss_color
+                    visualizer.add_arrow(
+                        origin, end, color, width=_RAY_WIDTH * size, label=f"{name}_ray_{i}"
+                    )
+                if not hit:
+                    continue
+                visualizer.add_sphere(
+                    end, viz.hit_sphere_radius * size, viz.hit_sphere_color, label=f"{name}_hit_{i}"
+                )
+                if viz.show_normals:
+                    tip = end + viz.normal_length * size * normal
+                    visualizer.add_arrow(
+                        end, tip, viz.normal_color, _RAY_WIDTH * size, label=f"{name}_normal_{i}"
+                    )
+
+
+class _Frames:
+    """Poses of several frames, in the order in which they were given."""
+
+    def __init__(
+        self, frames: tuple[ObjRef, ...], mj_model: mujoco.MjModel, data: Any, device: str
+    ) -> None:
+        """Find the frames; ValueError with close names for one that does not exist."""
+        self._data = data
+        self._parts: list[tuple[str, str, torch.Tensor, torch.Tensor]] = []
+        self.body_ids: list[int] = []
+        """The body that carries each frame."""
+        ids = []
+        owners = {"site": mj_model.site_bodyid, "geom": mj_model.geom_bodyid}
+        for frame in frames:
+            count = getattr(mj_model, f"n{frame.type}")
+            kind = _FRAMES[frame.type][2]
+            names = [mujoco.mj_id2name(mj_model, kind, i) or "" for i in range(count)]
+            index = names.index(find_in_scene("frame", frame, names))
+            ids.append(index)
+            self.body_ids.append(index if frame.type == "body" else int(owners[frame.type][index]))
+        for kind in dict.fromkeys(frame.type for frame in frames):
+            places = [i for i, frame in enumerate(frames) if frame.type == kind]
+            self._parts.append(
+                (
+                    *_FRAMES[kind][:2],
+                    torch.tensor(places, device=device),
+                    torch.tensor([ids[i] for i in places], device=device),
+                )
+            )
+
+    def read(self, pos: torch.Tensor, mat: torch.Tensor) -> None:
+        """Copy current positions into `pos` (N, F, 3) and orientations into `mat` (N, F, 3, 3)."""
+        for pos_field, mat_field, places, ids in self._parts:
+            for out, source in ((pos, pos_field), (mat, mat_field)):
+                values = getattr(self._data, source).index_select(1, ids)
+                if len(self._parts) == 1:
+                    out.copy_(values)
+                else:
+                    out.index_copy_(1, places, values)
+
+
+def _rotate_into(
+    out: torch.Tensor,
+    vectors: torch.Tensor,
+    mat: torch.Tensor,
+    alignment: RayAlignment,
+    start: torch.Tensor | None = None,
+) -> None:
+    """Write `start + A vectors` into `out`, with A the aligned orientation of each frame.
+
+    Column by column, because every column is one operation over all environments and rays, and
+    without a matrix product, which a GPU may round to TF32: centimetres, far from the origin.
+
+    Args:
+        out: (N, F, n, 3).
+        vectors: (n, 3) in the aligned frame.
+        mat: (N, F, 3, 3) orientations of the frames.
+        alignment: Which part of the orientation counts.
+        start: (N, F, 3) world positions; None for none.
+    """
+    x, y, z = vectors.unbind(-1)
+    if alignment == "yaw":
+        cosine, sine = (part[..., None] for part in _heading(mat))
+        turn = (cosine, -sine), (sine, cosine)
+    else:
+        turn = ()
+    for axis, column in enumerate(out.unbind(-1)):
+        if alignment == "base":
+            first, second, third = mat[..., axis, :, None].unbind(-2)
+            part = (first * x).addcmul_(second, y).addcmul_(third, z)
+        elif alignment == "world" or axis == 2:
+            part = vectors[:, axis].expand_as(column)
+        else:
+            first, second = turn[axis]
+            part = (first * x).addcmul_(second, y)
+        # The start comes last: far from the origin, sums with it are rounded most.
+        torch.add(part, 0.0 if start is None else start[..., axis, None], out=column)
+
+
+def _heading(mat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return cosine and sine of the yaw (...,) of rotation matrices (..., 3, 3).
+
+    The direction is that of the horizontal projection of the frame's x axis. Where the x axis is
+    nearly vertical (projection shorter than 0.1), it is the projection (a, b) of the y axis turned
+    back by a quarter: (b, -a).
+    """
+    # By components: an operation over a last dimension of two takes a CPU ten times as long.
+    x, y = mat[..., 0, 0], mat[..., 1, 0]
+    is_steep = x * x + y * y < _STEEP**2
+    x = torch.where(is_steep, mat[..., 1, 1], x)
+    y = torch.where(is_steep, -mat[..., 0, 1], y)
+    length = (x * x + y * y).sqrt_().clamp_(min=_TINY)
+    return x / length, y / length
 
 
 __getattr__ = older_names(__name__)

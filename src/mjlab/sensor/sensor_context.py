@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import torch
 
-from mjlab.sensor.camera_sensor import check_shared_cameras
+from mjlab.utils.errors import UnknownAttributeError
 from mjlab.utils.state import capture_state, restore_state
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class SensorContext:
         Raises:
             ValueError: two sensors want one camera to have two projections.
         """
-        check_shared_cameras(camera_sensors)
+        _check_shared_cameras(camera_sensors)
         self._model, self._data, self._device = model, data, device
         self._camera_sensors = list(camera_sensors)
         self._find_render_context: Callable[..., Any] | None = None
@@ -97,7 +97,9 @@ class SensorContext:
             RuntimeError: nothing has been rendered yet.
         """
         if not self._views or self._find_render_context is None:
-            raise AttributeError("There is no render context, because the scene has no camera.")
+            raise UnknownAttributeError(
+                "There is no render context, because the scene has no camera."
+            )
         return self._find_render_context(self._views, self._views[0])
 
     def set_render_context_source(self, find: Callable[..., Any]) -> None:
@@ -200,3 +202,19 @@ class _RayQuery:
         )
         for sensor, part in zip(self._sensors, self._parts, strict=True):
             sensor.set_results(distances[:, part], normals[:, part])
+
+
+def _check_shared_cameras(sensors: Sequence[CameraSensor]) -> None:
+    """Raise `ValueError` if two sensors want one camera to have different projections."""
+    first: dict[str, CameraSensor] = {}
+    for sensor in sensors:
+        other = first.setdefault(sensor.camera_name, sensor)
+        for field in ("fovy", "orthographic"):
+            values = getattr(other.cfg, field), getattr(sensor.cfg, field)
+            if values[0] != values[1]:
+                raise ValueError(
+                    f"Camera sensors {other.cfg.name!r} and {sensor.cfg.name!r} look through the "
+                    f"camera {sensor.camera_name!r}, but {field} is {values[0]!r} for the one and "
+                    f"{values[1]!r} for the other. Give both the same, or one a camera of its own "
+                    "(camera_name=None, with parent_body, pos and quat)."
+                )

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import mujoco
 import torch
 
+from mjlab.utils.errors import MjlabError, UnknownAttributeError, check_one_of
+
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
 
@@ -76,14 +78,14 @@ def check_sensor_fed(model: mujoco.MjModel, field: str) -> None:
     """
     if field == "qfrc_inverse":
         # No step runs inverse dynamics, so it would read zero for ever.
-        raise AttributeError(
+        raise UnknownAttributeError(
             "MuJoCo computes MjData.qfrc_inverse in inverse dynamics only, which no step runs. The "
             "forces that drive the joints are qfrc_actuator + qfrc_applied."
         )
     sensors = _SENSORS_BY_FIELD.get(field, ())
     types = [getattr(mujoco.mjtSensor, f"mjSENS_{name.upper()}") for name in sensors]
     if sensors and not any((model.sensor_type == kind).any() for kind in types):
-        raise AttributeError(
+        raise UnknownAttributeError(
             f"MuJoCo computes MjData.{field} only if the model has a sensor that needs it. Add one "
             f"of these sensors to it: {', '.join(sensors)}."
         )
@@ -189,7 +191,7 @@ def rendered_geoms(model: mujoco.MjModel, groups: Container[int]) -> list[int]:
 # Engine.
 
 
-class EngineUnavailableError(RuntimeError):
+class EngineUnavailableError(MjlabError, RuntimeError):
     """Raised at construction when the chosen engine cannot run here; says what to use instead."""
 
 
@@ -400,10 +402,7 @@ def resolve_engine_name(requested: str, device: str) -> str:
     on_cpu = device.split(":")[0] == "cpu"
     if requested == "auto":
         return "native" if on_cpu else "warp"
-    if requested not in _ENGINES:
-        raise ValueError(
-            f"Unknown engine {requested!r}. Choose one of: auto, {', '.join(_ENGINES)}."
-        )
+    check_one_of("SimulationCfg.engine", requested, ("auto", *_ENGINES))
     if requested == "native" and not on_cpu:
         raise EngineUnavailableError(
             f"The native engine runs on the CPU, but the device is {device!r}. "

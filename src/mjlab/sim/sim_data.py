@@ -11,6 +11,8 @@ from typing import Any, Generic, TypeVar
 
 import torch
 
+from mjlab.utils.errors import UnknownAttributeError, WrongStateError
+
 T = TypeVar("T")
 
 
@@ -52,7 +54,7 @@ class TorchArray(torch.Tensor):
 
     def __setitem__(self, idx: Any, value: Any) -> None:
         if self._is_shared:
-            raise RuntimeError(
+            raise WrongStateError(
                 "This model field is one row that all environments share. Give each its own with "
                 "sim.expand_model_fields((name,)) before writing it."
             )
@@ -80,7 +82,7 @@ class FieldView:
         # `data.qpos += 1` writes in place and then assigns the tensor to itself.
         if value is self.__dict__.get(name):
             return
-        raise AttributeError(
+        raise UnknownAttributeError(
             f"{self._owner}.{name} cannot be replaced; write into it in place: "
             f"{self._owner}.{name}[:] = ..."
         )

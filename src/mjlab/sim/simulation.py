@@ -30,6 +30,7 @@ from mjlab.sim.memory import bytes_per_environment, check_memory
 from mjlab.sim.randomization import RecomputeLevel, VariantInfo, VariantValues, is_structure
 from mjlab.sim.sim_data import FieldView
 from mjlab.sim.warning_log import collect_mujoco_warnings
+from mjlab.utils.errors import UnknownAttributeError, WrongStateError, check_positive
 from mjlab.utils.indexing import EnvIds, as_ids
 from mjlab.utils.mujoco import moving_dofs
 from mjlab.utils.nan_guard import NanGuard
@@ -39,55 +40,6 @@ logger = logging.getLogger(__name__)
 
 # Shapes of rows that MuJoCo stores flat, as MuJoCo Warp has them.
 _ROW_SHAPES = {"cam_mat0": (3, 3), "geom_aabb": (2, 3)}
-
-
-class SharedField(torch.Tensor):
-    """Model value that all environments share: reading is free, writing raises `RuntimeError`.
-
-    Writing one row would change every environment. Results of operations are plain tensors.
-    """
-
-    error: str
-
-    @classmethod
-    def make(cls, value: torch.Tensor, nworld: int | None, name: str) -> SharedField:
-        """View `value` as an (nworld, ...) field; as structure, in its own shape, if None."""
-        view = value if nworld is None else value.expand(nworld, *value.shape)
-        field = torch.Tensor._make_subclass(cls, view)
-        field.error = f"Model field {name!r} is shared by all environments and cannot be written. "
-        field.error += (
-            "Change it in the spec or the model from which the Simulation is built."
-            if nworld is None
-            else f"Call sim.expand_model_fields(({name!r},)) first, or declare it with "
-            f"@requires_model_fields({name!r})."
-        )
-        return field
-
-    @classmethod
-    def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        target = args[0] if args else None
-        name = getattr(func, "__name__", "")
-        writes = name == "__setitem__" or (name.endswith("_") and not name.endswith("__"))
-        out = (kwargs or {}).get("out")
-        outputs = out if isinstance(out, tuple | list) else (out,)
-        for tensor in (target, *outputs) if writes else outputs:
-            if isinstance(tensor, SharedField):
-                raise RuntimeError(tensor.error)
-        with torch._C.DisableTorchFunctionSubclass():
-            result = func(*args, **(kwargs or {}))
-        # Views still alias the shared value, so they stay protected. Without elements all tensors
-        # have the same address.
-        if isinstance(target, SharedField):
-            if isinstance(result, np.ndarray):
-                result.flags.writeable = False
-            elif (
-                isinstance(result, torch.Tensor)
-                and result.numel()
-                and result.untyped_storage().data_ptr() == target.untyped_storage().data_ptr()
-            ):
-                result = result.as_subclass(cls)
-                result.error = target.error
-        return result
 
 
 class Simulation:
@@ -127,8 +79,7 @@ class Simulation:
                 differ in what the engine cannot hold per environment.
             EngineUnavailableError: the chosen engine cannot run on `device`.
         """
-        if num_envs < 1:
-            raise ValueError(f"The number of environments is {num_envs}; it has to be at least 1.")
+        check_positive("num_envs", num_envs)
         if (model is None) == (spec is None):
             raise ValueError("Give Simulation exactly one of `model` and `spec`.")
         engine_name = resolve_engine_name(cfg.engine, device)
@@ -205,7 +156,7 @@ class Simulation:
 
     def _warp_engine(self, name: str, instead: str) -> Any:
         if self.engine_name != "warp":
-            raise AttributeError(
+            raise UnknownAttributeError(
                 f"Simulation.{name} exists on the warp engine only, and this is "
                 f"{self.engine_name}; use {instead}, which works on both."
             )
@@ -283,7 +234,7 @@ class Simulation:
         try:
             value = self._host_value(name)
         except ValueError as error:
-            raise AttributeError(str(error)) from error
+            raise UnknownAttributeError(str(error)) from error
         if isinstance(value, int | bytes):
             return value
         rows = None if is_structure(name, np.asarray(value)) else self.num_envs
@@ -291,7 +242,7 @@ class Simulation:
 
     def _read_option(self, name: str) -> Any:
         if not hasattr(self._default_model.opt, name):
-            raise AttributeError(f"MjOption has no field {name!r}.")
+            raise UnknownAttributeError(f"MjOption has no field {name!r}.")
         return self._read_model_field(name)
 
     def _apply_variants(self, info: list[tuple[str, VariantInfo]]) -> None:
@@ -371,7 +322,7 @@ class Simulation:
         sensors of later stages keep their values.
         """
         self._engine.forward(self.resolve_ids(env_ids), stage)
-        self._tell_forward(stage)
+        self._notify_forward(stage)
 
     def forward_after_reset(self, env_ids: torch.Tensor) -> None:
         """Run `forward(env_ids)`, and `forward(stage="vel")` for the other environments.
@@ -381,7 +332,7 @@ class Simulation:
         resolved = self.resolve_ids(env_ids)
         assert resolved is not None
         self._engine.forward_after_reset(resolved)
-        self._tell_forward("acc")
+        self._notify_forward("acc")
 
     @contextlib.contextmanager
     def looking_ahead(self, env_ids: torch.Tensor) -> Generator[None]:
@@ -398,9 +349,9 @@ class Simulation:
             if self._sensor_context is not None:
                 undo.enter_context(self._sensor_context.results_kept())
             before = self._engine.look_ahead(env_ids)
-            undo.callback(self._tell_forward, "acc")
+            undo.callback(self._notify_forward, "acc")
             undo.callback(self._engine.look_back, env_ids, before)
-            self._tell_forward("vel")
+            self._notify_forward("vel")
             yield
 
     def bad_states(self) -> torch.Tensor:
@@ -425,7 +376,7 @@ class Simulation:
         """Call `callback(stage)` after every `forward`: derived fields up to a stage have changed."""
         self._forward_callbacks.append(callback)
 
-    def _tell_forward(self, stage: Stage) -> None:
+    def _notify_forward(self, stage: Stage) -> None:
         for callback in self._forward_callbacks:
             callback(stage)
 
@@ -546,7 +497,7 @@ class Simulation:
         self.check_state(state)
         self.expand_model_fields(tuple(state["model"]))
         self._engine.load_state_dict(state)
-        self._tell_forward("acc")
+        self._notify_forward("acc")
 
     def close(self) -> None:
         """Free what the engine holds outside Python's reach."""
@@ -559,6 +510,55 @@ class Simulation:
         ids = as_ids(env_ids, self.num_envs, self.device)
         # To sort them, the host would have to wait for a GPU.
         return ids if ids.is_cuda or len(ids) < 2 else ids.unique()
+
+
+class SharedField(torch.Tensor):
+    """Model value that all environments share: reading is free, writing raises `RuntimeError`.
+
+    Writing one row would change every environment. Results of operations are plain tensors.
+    """
+
+    error: str
+
+    @classmethod
+    def make(cls, value: torch.Tensor, nworld: int | None, name: str) -> SharedField:
+        """View `value` as an (nworld, ...) field; as structure, in its own shape, if None."""
+        view = value if nworld is None else value.expand(nworld, *value.shape)
+        field = torch.Tensor._make_subclass(cls, view)
+        field.error = f"Model field {name!r} is shared by all environments and cannot be written. "
+        field.error += (
+            "Change it in the spec or the model from which the Simulation is built."
+            if nworld is None
+            else f"Call sim.expand_model_fields(({name!r},)) first, or declare it with "
+            f"@requires_model_fields({name!r})."
+        )
+        return field
+
+    @classmethod
+    def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        target = args[0] if args else None
+        name = getattr(func, "__name__", "")
+        writes = name == "__setitem__" or (name.endswith("_") and not name.endswith("__"))
+        out = (kwargs or {}).get("out")
+        outputs = out if isinstance(out, tuple | list) else (out,)
+        for tensor in (target, *outputs) if writes else outputs:
+            if isinstance(tensor, SharedField):
+                raise WrongStateError(tensor.error)
+        with torch._C.DisableTorchFunctionSubclass():
+            result = func(*args, **(kwargs or {}))
+        # Views still alias the shared value, so they stay protected. Without elements all tensors
+        # have the same address.
+        if isinstance(target, SharedField):
+            if isinstance(result, np.ndarray):
+                result.flags.writeable = False
+            elif (
+                isinstance(result, torch.Tensor)
+                and result.numel()
+                and result.untyped_storage().data_ptr() == target.untyped_storage().data_ptr()
+            ):
+                result = result.as_subclass(cls)
+                result.error = target.error
+        return result
 
 
 def _reshape_rows(field: str, tensor: torch.Tensor) -> torch.Tensor:

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjlab.compat import older_names
+from mjlab.utils.errors import MjlabError, UnknownNameError
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -81,18 +82,15 @@ ENTRY_POINT_GROUP = "mjlab.tasks"
 _COMPAT_MODULES = frozenset({"torchrunx", "mediapy", "moviepy"})
 
 
-class UnknownTaskError(KeyError):
+class UnknownTaskError(UnknownNameError):
     """Raised for a task name that is not registered; the message lists the nearest ones."""
 
-    def __str__(self) -> str:
-        return str(self.args[0])
 
-
-class UnknownProfileError(ValueError):
+class UnknownProfileError(MjlabError, ValueError):
     """Raised for a profile that a task does not have; the message lists those it has."""
 
 
-class TaskImportError(RuntimeError):
+class TaskImportError(MjlabError, RuntimeError):
     """Raised for a task whose config, runner or profile, given by name, cannot be imported."""
 
 

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Builder of box sub-terrains: solid boxes, rings, frames and pits, and their colors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mjlab.terrains.terrain_generator import TerrainGeometry, TerrainOutput
 from mjlab.terrains.utils import add_box
 from mjlab.utils.color import brand_ramp, darken_rgba
 
-# MERGED mjlab.terrains.boxes: What all box sub-terrains share: solid boxes, rings of boxes, frames and pits, and colours.
+RGBA = tuple[float, float, float, float]
 
 BLUE = (0.20, 0.45, 0.95)
 RED = (0.90, 0.30, 0.30)
@@ -23,17 +23,6 @@ MIN_THICKNESS = 0.5
 
 # Boxes narrower than this are rounding errors of a layout that leaves no room for them.
 _NO_LENGTH = 1e-9
-RGBA = tuple[float, float, float, float]
-
-
-def frame_color(base: tuple[float, float, float]) -> RGBA:
-    """Return the colour of the frame of a sub-terrain that has the base colour."""
-    return darken_rgba(brand_ramp(base, 0.0), 0.85)
-
-
-def inset(extent: tuple[float, float], by: float) -> tuple[float, float]:
-    """Return the extent of a rectangle made smaller by a distance on each side."""
-    return extent[0] - 2.0 * by, extent[1] - 2.0 * by
 
 
 class Boxes:
@@ -155,9 +144,6 @@ class Boxes:
         self.add_platform(self.size, -depth, (0.1, 0.1, 0.1, 1.0))
 
 
-# MERGED mjlab.terrains.boxes: Joining neighbouring cells of a grid into rectangles, for fewer geoms.
-
-
 def merge_equal_cells(
     values: np.ndarray, kept: np.ndarray, longest: int
 ) -> Iterator[tuple[int, int, int, int]]:
@@ -189,3 +175,13 @@ def merge_equal_cells(
 def _run(flags: np.ndarray) -> int:
     """Return how many of the first flags are set."""
     return len(flags) if flags.all() else int(np.argmin(flags))
+
+
+def frame_color(base: tuple[float, float, float]) -> RGBA:
+    """Return the colour of the frame of a sub-terrain that has the base colour."""
+    return darken_rgba(brand_ramp(base, 0.0), 0.85)
+
+
+def inset(extent: tuple[float, float], by: float) -> tuple[float, float]:
+    """Return the extent of a rectangle made smaller by a distance on each side."""
+    return extent[0] - 2.0 * by, extent[1] - 2.0 * by

@@ -14,8 +14,6 @@ import mujoco
 import numpy as np
 
 from mjlab.compat import older_names
-from mjlab.sim.memory import available_memory
-from mjlab.terrains._fields import lerp, refuse_unless, refuse_unless_positive, refuse_unless_range
 from mjlab.terrains.terrain_generator import (
     SubTerrainCfg,
     TerrainGeometry,
@@ -26,17 +24,463 @@ from mjlab.terrains.utils import (
     check_flat_patch,
     find_flat_patches_from_heightfield,
     interpolate_cubic,
+    lerp,
     resample_linear,
 )
+from mjlab.utils.errors import check_field, check_field_range, check_fields_positive
 
-# MERGED mjlab.terrains.heightfield_terrains: Colours for height fields.
+# A thin sheet lets fast or deep contacts through to the other side.
+MIN_BASE_THICKNESS = 0.5
 
+# Radius around the centre in which robots are placed and reach (m).
+SPAWN_RADIUS = 1.0
+
+# A mistyped pixel size should raise, rather than fill the memory.
+_MAX_PIXELS = 10_000_000
+
+# Obstacles stand, and their footprints grow, in steps of this many pixels.
+_OBSTACLE_STEP = 4
+
+# A field of Perlin noise is at least this high, in metres.
+_MIN_PERLIN_HEIGHT = 0.001
+
+# Gradients by the last two bits of a hash: x + y, x - y, -x + y, -x - y.
+_SIGNS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 
 # The height above or below z = 0, in metres, at which colours stop changing.
 _FULL_COLOR_HEIGHT = 0.75
 
 # The hue at z = 0, a green; it goes to red above and to blue below.
 _GROUND_HUE = 0.33
+
+
+@dataclass(kw_only=True)
+class HfDiscreteObstaclesTerrainCfg(SubTerrainCfg):
+    """Blocks and pits of random sizes at random places."""
+
+    obstacle_height_mode: Literal["choice", "fixed"] = "choice"
+    """`fixed` gives every obstacle the full height; `choice` draws from the full and half height,
+    up and down."""
+    obstacle_width_range: tuple[float, float]
+    """Smallest and largest side of an obstacle, in metres."""
+    obstacle_height_range: tuple[float, float]
+    """Full height of obstacles at difficulty 0 and 1, in metres."""
+    num_obstacles: int
+    """Number of obstacles; later ones overwrite earlier ones."""
+    platform_width: float = 1.0
+    """Side of the square at the centre that is cleared, in metres."""
+    horizontal_scale: float = 0.1
+    """Size of a pixel, in metres."""
+    vertical_scale: float = 0.005
+    """Step of heights, in metres."""
+    base_thickness_ratio: float = 1.0
+    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
+    border_width: float = 0.0
+    """Width of the flat border, in metres: 0, or at least one pixel."""
+    square_obstacles: bool = False
+    """Whether obstacles are as long as they are wide."""
+    origin_z_offset: float = 0.0
+    """How far above the platform robots start, in metres."""
+
+    def function(
+        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
+    ) -> TerrainOutput:
+        """Add the terrain; robots start on the platform.
+
+        Obstacles begin at every fourth pixel inside the border, and are cut off where it ends.
+        """
+        check_heightfield(self, "vertical_scale")
+        mode, modes = self.obstacle_height_mode, ("choice", "fixed")
+        check_field(self, "obstacle_height_mode", mode in modes, f"one of {modes}")
+        check_field_range(self, "obstacle_width_range", lowest=self.horizontal_scale)
+        check_field_range(self, "obstacle_height_range", lowest=0.0)
+        check_field(self, "num_obstacles", self.num_obstacles >= 0, "a number >= 0")
+        pixels = divide_into_pixels(self)
+        check_platform_fits(self)
+        full = int(lerp(self.obstacle_height_range, difficulty) / self.vertical_scale)
+        heights = [full] if mode == "fixed" else [-full, -full // 2, full // 2, full]
+        narrow, wide = (int(width / self.horizontal_scale) for width in self.obstacle_width_range)
+        sides = np.arange(narrow, wide + 1, _OBSTACLE_STEP)
+        inner = np.zeros(pixels.inner, dtype=int)
+        starts = [np.arange(0, count, _OBSTACLE_STEP) for count in pixels.inner]
+        for _ in range(self.num_obstacles):
+            height, width = rng.choice(heights), rng.choice(sides)
+            length = width if self.square_obstacles else rng.choice(sides)
+            row, col = (rng.choice(start) for start in starts)
+            inner[row : row + width, col : col + length] = height
+        noise = pixels.with_border(inner)
+        half = int(self.platform_width / self.horizontal_scale) // 2
+        row, col = pixels.rows // 2, pixels.cols // 2
+        noise[row - half : row + half, col - half : col + half] = 0
+        field = add_noise(self, spec, noise)
+        # Without a platform robots stand on whatever there is at the centre.
+        around = max(half, 1)
+        ground = field.surface[row - around : row + around, col - around : col + around].max()
+        return finish(self, field, float(ground) + self.origin_z_offset, rng)
+
+
+@dataclass(kw_only=True)
+class HfPyramidSlopedTerrainCfg(SubTerrainCfg):
+    """A hill with a flat top, or, inverted, a hollow with a flat bottom."""
+
+    slope_range: tuple[float, float]
+    """Rise over run along the centre lines, at difficulty 0 and 1."""
+    platform_width: float = 1.0
+    """Side of the flat square at the centre, in metres."""
+    inverted: bool = False
+    """Whether it goes down instead of up."""
+    border_width: float = 0.0
+    """Width of the flat border, in metres: 0, or at least one pixel."""
+    horizontal_scale: float = 0.1
+    """Size of a pixel, in metres."""
+    vertical_scale: float = 0.005
+    """Step of heights, in metres."""
+    base_thickness_ratio: float = 1.0
+    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
+
+    def function(
+        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
+    ) -> TerrainOutput:
+        """Add the terrain; robots start on the platform.
+
+        Heights are `peak a(x) a(y)` with `a(x) = (c - |c - x|) / c`, c half the number of pixels,
+        cut off where the platform begins.
+        """
+        check_heightfield(self, "vertical_scale")
+        pixels = divide_into_pixels(self)
+        check_field_range(self, "slope_range")
+        check_platform_fits(self)
+        slope = lerp(self.slope_range, difficulty) * (-1.0 if self.inverted else 1.0)
+        peak = int(slope * pixels.inner_size[0] / 2 / self.vertical_scale)
+        # Tents: 0 at the start and 1 in the middle.
+        middles = [(count // 2, np.arange(count)) for count in pixels.inner]
+        ramp_y, ramp_x = ((middle - np.abs(middle - k)) / middle for middle, k in middles)
+        raw = peak * ramp_y[:, None] * ramp_x[None, :]
+        half = int(self.platform_width / self.horizontal_scale / 2)
+        row, col = (max(count // 2 - half, 0) for count in pixels.inner)
+        cut = raw[row, col]
+        raw = np.clip(raw, min(cut, 0.0), max(cut, 0.0))
+        noise = pixels.with_border(np.rint(raw).astype(int))
+        field = add_noise(self, spec, noise)
+        centre = field.surface[pixels.rows // 2, pixels.cols // 2]
+        return finish(self, field, float(centre), rng)
+
+
+@dataclass(kw_only=True)
+class HfRandomUniformTerrainCfg(SubTerrainCfg):
+    """Rough ground: random heights, interpolated if they are drawn more coarsely than pixels."""
+
+    noise_range: tuple[float, float]
+    """Lowest and highest height, in metres."""
+    noise_step: float = 0.005
+    """Step between possible heights, in metres; at least `vertical_scale`."""
+    downsampled_scale: float | None = None
+    """Distance between drawn heights, in metres, at least a pixel; None for one at each pixel."""
+    horizontal_scale: float = 0.1
+    """Size of a pixel, in metres."""
+    vertical_scale: float = 0.005
+    """Step of heights, in metres."""
+    base_thickness_ratio: float = 1.0
+    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
+    border_width: float = 0.0
+    """Width of the flat border, in metres: 0, or at least one pixel."""
+    scale_with_difficulty: bool = False
+    """Whether the range is multiplied by the difficulty, which otherwise changes nothing."""
+
+    def function(
+        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
+    ) -> TerrainOutput:
+        """Add the terrain; robots start at the height of the highest ground within 1 m."""
+        check_heightfield(self, "vertical_scale", "noise_step")
+        pixels = divide_into_pixels(self)
+        check_field_range(self, "noise_range")
+        step = int(self.noise_step / self.vertical_scale)
+        least = f"a multiple of vertical_scale = {self.vertical_scale:g} m, the step of heights"
+        check_field(self, "noise_step", step >= 1, least)
+        spacing = self._spacing(pixels.inner_size)
+        factor = difficulty if self.scale_with_difficulty else 1.0
+        low, high = (int(factor * end / self.vertical_scale) for end in self.noise_range)
+        # The first axis is the row, that is y.
+        counts = [int(extent / spacing) for extent in pixels.inner_size[::-1]]
+        drawn = rng.choice(np.arange(low, high + step, step), size=counts)
+        noise = pixels.with_border(interpolate_cubic(drawn, pixels.inner))
+        field = add_noise(self, spec, noise)
+        return finish(self, field, field.highest_near_centre(), rng)
+
+    def _spacing(self, inner_size: tuple[float, float]) -> float:
+        """Return the distance between drawn heights, which must give two along each side."""
+        if self.downsampled_scale is None:
+            return self.horizontal_scale
+        low, high = self.horizontal_scale, min(inner_size) / 2
+        holds = low <= self.downsampled_scale <= high
+        expected = f"a length from horizontal_scale = {low:g} to {high:g} m"
+        check_field(self, "downsampled_scale", holds, expected)
+        return self.downsampled_scale
+
+
+@dataclass(kw_only=True)
+class HfWaveTerrainCfg(SubTerrainCfg):
+    """Waves along both axes, added up."""
+
+    amplitude_range: tuple[float, float]
+    """Twice the amplitude of each of the two waves at difficulty 0 and 1, in metres: half of the
+    difference between the highest and the lowest point."""
+    num_waves: int = 1
+    """Number of waves along y inside the border; along x the wavelength is the same."""
+    horizontal_scale: float = 0.1
+    """Size of a pixel, in metres."""
+    vertical_scale: float = 0.005
+    """Step of heights, in metres."""
+    base_thickness_ratio: float = 0.25
+    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
+    border_width: float = 0.0
+    """Width of the flat border, in metres: 0, or at least one pixel."""
+
+    def function(
+        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
+    ) -> TerrainOutput:
+        """Add the terrain; robots start at the height of the highest ground within 1 m.
+
+        Heights are `A (cos(2 pi n col / L) + sin(2 pi n row / L))` with L the number of rows inside
+        the border and A half the amplitude.
+        """
+        check_heightfield(self, "vertical_scale")
+        pixels = divide_into_pixels(self)
+        check_field_range(self, "amplitude_range", lowest=0.0)
+        most = pixels.inner[0] // 2
+        expected = f"1 to {most} waves, which is what {pixels.inner[0]} pixels along y can show"
+        check_field(self, "num_waves", 0 < self.num_waves <= most, expected)
+        amplitude = int(0.5 * lerp(self.amplitude_range, difficulty) / self.vertical_scale)
+        rows, cols = pixels.inner
+        turn = 2.0 * np.pi * self.num_waves / rows
+        raw = np.sin(turn * np.arange(rows))[:, None] + np.cos(turn * np.arange(cols))[None, :]
+        noise = pixels.with_border(np.rint(amplitude * raw).astype(int))
+        field = add_noise(self, spec, noise)
+        return finish(self, field, field.highest_near_centre(), rng)
+
+
+@dataclass(kw_only=True)
+class HfPerlinNoiseTerrainCfg(SubTerrainCfg):
+    """Smooth hills of several sizes: fractal Perlin noise."""
+
+    height_range: tuple[float, float]
+    """Height of the highest point over the lowest at difficulty 0 and 1, in metres."""
+    octaves: int = 4
+    """Number of layers of noise, each finer and weaker than the one before."""
+    persistence: float = 0.5
+    """How much weaker each layer is, as a factor."""
+    lacunarity: float = 2.0
+    """How much finer each layer is, as a factor."""
+    scale: float = 10.0
+    """Number of hills of the first layer along each side, times horizontal_scale / resolution."""
+    horizontal_scale: float = 0.1
+    """Size that `scale` refers to, in metres."""
+    resolution: float = 0.05
+    """Size of a pixel, in metres."""
+    base_thickness_ratio: float = 1.0
+    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
+    border_width: float = 0.0
+    """Width of the flat border, in metres: 0, or at least one pixel."""
+
+    def function(
+        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
+    ) -> TerrainOutput:
+        """Add the terrain; robots start at the height of the highest ground within 1 m."""
+        check_heightfield(self, "scale", "lacunarity", "resolution")
+        check_field(self, "octaves", self.octaves >= 1, "a number >= 1")
+        check_field(self, "persistence", self.persistence >= 0.0, "a number >= 0")
+        check_field_range(self, "height_range", lowest=0.0)
+        pixels = divide_into_pixels(self, "resolution")
+        frequency = self.scale * self.resolution / self.horizontal_scale
+        check_field(
+            self, "scale", 2 * frequency <= min(pixels.inner),
+            f"a number that makes at most {min(pixels.inner) // 2} hills along each side, which is "
+            f"what {min(pixels.inner)} pixels can show (this makes {frequency:g})",
+        )  # fmt: skip
+        noise = fractal_noise(
+            pixels.inner, frequency, self.octaves, self.persistence, self.lacunarity, rng
+        )
+        height = max(lerp(self.height_range, difficulty), _MIN_PERLIN_HEIGHT)
+        surface = pixels.with_border(noise) * height
+        field = add_heightfield(spec, self.size, surface, self.base_thickness_ratio, height)
+        return finish(self, field, field.highest_near_centre(), rng, pixel=self.resolution)
+
+
+# Pixels and checks.
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """How a sub-terrain is divided into pixels. Arrays are indexed [row, col]: rows run along y."""
+
+    rows: int
+    """Number of pixels along y, border included."""
+    cols: int
+    """Number of pixels along x, border included."""
+    border: int
+    """Width of the border, which stays at height 0, in pixels."""
+    inner_size: tuple[float, float]
+    """Extent of the ground inside the border along x and y, in metres."""
+
+    @property
+    def inner(self) -> tuple[int, int]:
+        """Number of rows and columns inside the border."""
+        return self.rows - 2 * self.border, self.cols - 2 * self.border
+
+    def with_border(self, inner: np.ndarray) -> np.ndarray:
+        """Return heights of the whole field, from (rows, cols) ones inside the border."""
+        return np.pad(inner, self.border)
+
+
+def divide_into_pixels(cfg: SubTerrainCfg, pixel_field: str = "horizontal_scale") -> Pixels:
+    """Divide `cfg.size` into pixels of the size in the given field of the config.
+
+    The number of columns comes from the x size and that of rows from the y size, both truncated.
+
+    Raises:
+        ValueError: pixels or border do not fit the size.
+    """
+    check_fields_positive(cfg, pixel_field)
+    pixel, border_width = getattr(cfg, pixel_field), getattr(cfg, "border_width")  # noqa: B009
+    check_field(
+        cfg, "border_width", border_width == 0.0 or border_width >= pixel,
+        f"0, or at least one pixel ({pixel_field} = {pixel:g} m)",
+    )  # fmt: skip
+    # In floats, because a tiny pixel makes more columns than an integer holds.
+    num_pixels = float(np.floor(cfg.size[0] / pixel) * np.floor(cfg.size[1] / pixel))
+    check_field(
+        cfg, pixel_field, num_pixels <= _MAX_PIXELS,
+        f"a length that makes at most {_MAX_PIXELS:,} pixels of {tuple(cfg.size)} m (this makes "
+        f"{num_pixels:,.0f})",
+    )  # fmt: skip
+    border = int(border_width / pixel)
+    cols, rows = (int(extent / pixel) for extent in cfg.size)
+    check_field(
+        cfg, "size", min(rows, cols) - 2 * border >= 2,
+        f"at least 2 x 2 pixels of ground with {pixel_field} = {pixel:g} and border_width = "
+        f"{border_width:g}",
+    )  # fmt: skip
+    if border == 0:
+        return Pixels(rows, cols, 0, (cfg.size[0], cfg.size[1]))
+    inner_size = ((cols - 2 * border) * pixel, (rows - 2 * border) * pixel)
+    return Pixels(rows, cols, border, inner_size)
+
+
+def check_heightfield(cfg: SubTerrainCfg, *scales: str) -> None:
+    """Check what all height fields have. `scales` are fields that must be positive."""
+    check_fields_positive(cfg, "horizontal_scale", "base_thickness_ratio", *scales)
+    for name, patch in (cfg.flat_patch_sampling or {}).items():
+        check_flat_patch(name, patch, cfg.size)
+
+
+def check_platform_fits(cfg: Any) -> None:
+    """Raise `ValueError` unless the platform fits inside the border."""
+    room = min(cfg.size) - 2.0 * cfg.border_width
+    check_field(
+        cfg, "platform_width", 0.0 <= cfg.platform_width <= room,
+        f"a length from 0 to {room:g} m, which is what the border leaves of the size "
+        f"{tuple(cfg.size)}",
+    )  # fmt: skip
+
+
+# Fields and their colours.
+
+
+@dataclass(frozen=True)
+class Heightfield:
+    """A height field in a spec, and the surface that it shows."""
+
+    hfield: mujoco.MjsHField
+    geom: mujoco.MjsGeom
+    surface: np.ndarray
+    """(rows, cols) heights of the vertices, in metres; z of the world."""
+    size: tuple[float, float]
+    """Extent along x and y, in metres. Vertices are at multiples of size / (n - 1)."""
+
+    def highest_near_centre(self, radius: float = SPAWN_RADIUS) -> float:
+        """Return the highest vertex within `radius` of the centre, in metres."""
+        y, x = (
+            np.linspace(-extent / 2, extent / 2, count)
+            for extent, count in zip(self.size[::-1], self.surface.shape, strict=True)
+        )
+        squared = y[:, None] ** 2 + x[None, :] ** 2
+        # On a field with fewer vertices than that, the ones around the centre count.
+        return float(self.surface[squared <= max(radius**2, squared.min() + 1e-9)].max())
+
+
+def add_heightfield(
+    spec: mujoco.MjSpec,
+    size: tuple[float, float],
+    surface: np.ndarray,
+    thickness_ratio: float,
+    flat_elevation: float,
+) -> Heightfield:
+    """Add a height field whose surface is exactly `surface` to the body `terrain` of the spec.
+
+    MuJoCo stores elevations from 0 to 1, with rows along +y and columns along +x; vertices are
+    `size / (n - 1)` apart. The geom is centred at half the size, at the height of the lowest
+    vertex. Below that is a base of `thickness_ratio` times the elevation, at least 0.5 m.
+
+    Args:
+        spec: Where to add it.
+        size: Extent along x and y, in metres.
+        surface: (rows, cols) heights in metres, [row, col].
+        thickness_ratio: Thickness of the base over the elevation.
+        flat_elevation: The elevation that a flat field states, in metres; MuJoCo refuses 0.
+    """
+    low = float(surface.min())
+    span = float(surface.max()) - low
+    elevation = span if span > 0.0 else flat_elevation
+    name = asset_name(spec, "hfield")
+    hfield = spec.add_hfield(
+        name=name,
+        nrow=surface.shape[0],
+        ncol=surface.shape[1],
+        size=(
+            size[0] / 2,
+            size[1] / 2,
+            elevation,
+            max(elevation * thickness_ratio, MIN_BASE_THICKNESS),
+        ),
+        userdata=((surface - low) / elevation).ravel().tolist(),
+    )
+    geom = spec.body("terrain").add_geom(
+        type=mujoco.mjtGeom.mjGEOM_HFIELD,
+        hfieldname=name,
+        pos=(size[0] / 2, size[1] / 2, low),
+        material=color_by_height(spec, surface, name, surface),
+    )
+    return Heightfield(hfield, geom, surface, (size[0], size[1]))
+
+
+def add_noise(cfg: Any, spec: mujoco.MjSpec, noise: np.ndarray) -> Heightfield:
+    """Add a field of whole multiples of `vertical_scale`."""
+    return add_heightfield(
+        spec, cfg.size, noise * cfg.vertical_scale, cfg.base_thickness_ratio, cfg.vertical_scale
+    )
+
+
+def finish(
+    cfg: Any,
+    field: Heightfield,
+    spawn_height: float,
+    rng: np.random.Generator,
+    pixel: float | None = None,
+) -> TerrainOutput:
+    """Return a field and its spawn point, and draw its flat patches."""
+    low = float(field.surface.min())
+    patches = {
+        name: find_flat_patches_from_heightfield(
+            field.surface - low, pixel or cfg.horizontal_scale, low, patch, rng, size=field.size
+        )
+        for name, patch in (cfg.flat_patch_sampling or {}).items()
+    }
+    return TerrainOutput(
+        origin=np.array([field.size[0] / 2, field.size[1] / 2, spawn_height]),
+        # It keeps the colours of its texture.
+        geometries=[TerrainGeometry(geom=field.geom, hfield=field.hfield)],
+        flat_patches=patches or None,
+    )
 
 
 def color_by_height(
@@ -88,304 +532,7 @@ def hsv_to_rgb(hue: np.ndarray, saturation: np.ndarray, value: np.ndarray) -> np
     return (value * 1.0)[..., None] - (value * saturation)[..., None] * drop
 
 
-# MERGED mjlab.terrains.heightfield_terrains: What all height fields share: their checks, their pixels, and the MuJoCo field with its texture.
-
-
-# A thin sheet lets fast or deep contacts through to the other side.
-MIN_BASE_THICKNESS = 0.5
-
-# How far around the centre a robot may be placed, and how far it may reach.
-SPAWN_RADIUS = 1.0
-
-# A mistyped pixel size should be told, rather than fill the memory.
-_MAX_PIXELS = 10_000_000
-
-# Bytes of a pixel, at least: its height in the spec, in the model and in the host data's model, and color.
-_BYTES_PER_PIXEL = 14
-
-
-@dataclass(frozen=True)
-class Pixels:
-    """How a sub-terrain is divided into pixels. Arrays are indexed [row, col]: rows run along y."""
-
-    rows: int
-    """Number of pixels along y, border included."""
-    cols: int
-    """Number of pixels along x, border included."""
-    border: int
-    """Width of the border, which stays at height 0, in pixels."""
-    inner_size: tuple[float, float]
-    """Extent of the ground inside the border along x and y, in metres."""
-
-    @property
-    def inner(self) -> tuple[int, int]:
-        """Number of rows and columns inside the border."""
-        return self.rows - 2 * self.border, self.cols - 2 * self.border
-
-    def with_border(self, inner: np.ndarray) -> np.ndarray:
-        """Return heights of the whole field, from (rows, cols) ones inside the border."""
-        return np.pad(inner, self.border)
-
-
-def divide_into_pixels(cfg: SubTerrainCfg, pixel_field: str = "horizontal_scale") -> Pixels:
-    """Divide `cfg.size` into pixels of the size in the given field of the config.
-
-    The number of columns comes from the x size and that of rows from the y size, both truncated.
-
-    Raises:
-        ValueError: pixels or border do not fit the size.
-    """
-    refuse_unless_positive(cfg, pixel_field)
-    pixel, border_width = getattr(cfg, pixel_field), getattr(cfg, "border_width")  # noqa: B009
-    refuse_unless(
-        border_width == 0.0 or border_width >= pixel,
-        cfg,
-        "border_width",
-        f"it must be 0, or at least one pixel ({pixel_field} = {pixel:g} m).",
-    )
-    refuse_unless(
-        all(extent / pixel <= _MAX_PIXELS for extent in cfg.size),
-        cfg,
-        pixel_field,
-        f"expected at most {_MAX_PIXELS:,} pixels of {tuple(cfg.size)} m. Use larger ones.",
-    )
-    border = int(border_width / pixel)
-    cols, rows = (int(extent / pixel) for extent in cfg.size)
-    refuse_unless(
-        min(rows, cols) - 2 * border >= 2,
-        cfg,
-        "size",
-        f"with {pixel_field} = {pixel:g} and border_width = {border_width:g} that leaves less than "
-        "2 x 2 pixels of ground. Make it larger, or the pixels or the border smaller.",
-    )
-    refuse_unless(
-        rows * cols <= _MAX_PIXELS,
-        cfg,
-        pixel_field,
-        f"that makes {rows * cols:,} pixels of {tuple(cfg.size)} m. Use larger ones; at most "
-        f"{_MAX_PIXELS:,} are allowed.",
-    )
-    if border == 0:
-        return Pixels(rows, cols, 0, (cfg.size[0], cfg.size[1]))
-    inner_size = ((cols - 2 * border) * pixel, (rows - 2 * border) * pixel)
-    return Pixels(rows, cols, border, inner_size)
-
-
-def refuse_unless_platform_fits(cfg: Any) -> None:
-    """Raise `ValueError` unless the platform fits inside the border."""
-    room = min(cfg.size) - 2.0 * cfg.border_width
-    refuse_unless(
-        0.0 <= cfg.platform_width <= room,
-        cfg,
-        "platform_width",
-        f"it must be from 0 to {room:g} m, which is what the border leaves of the size "
-        f"{tuple(cfg.size)}.",
-    )
-
-
-@dataclass(frozen=True)
-class Heightfield:
-    """A height field in a spec, and the surface that it shows."""
-
-    hfield: mujoco.MjsHField
-    geom: mujoco.MjsGeom
-    surface: np.ndarray
-    """(rows, cols) heights of the vertices, in metres; z of the world."""
-    size: tuple[float, float]
-    """Extent along x and y, in metres. Vertices are at multiples of size / (n - 1)."""
-
-    def highest_near_centre(self, radius: float = SPAWN_RADIUS) -> float:
-        """Return the highest vertex within `radius` of the centre, in metres."""
-        y, x = (
-            np.linspace(-extent / 2, extent / 2, count)
-            for extent, count in zip(self.size[::-1], self.surface.shape, strict=True)
-        )
-        squared = y[:, None] ** 2 + x[None, :] ** 2
-        # On a field with fewer vertices than that, the ones around the centre count.
-        return float(self.surface[squared <= max(radius**2, squared.min() + 1e-9)].max())
-
-
-def add_heightfield(
-    spec: mujoco.MjSpec,
-    size: tuple[float, float],
-    surface: np.ndarray,
-    thickness_ratio: float,
-    flat_elevation: float,
-) -> Heightfield:
-    """Add a height field whose surface is exactly `surface` to the body `terrain` of the spec.
-
-    MuJoCo stores elevations from 0 to 1, with rows along +y and columns along +x; vertices are
-    `size / (n - 1)` apart. The geom is centred at half the size, at the height of the lowest
-    vertex. Below that is a base of `thickness_ratio` times the elevation, at least 0.5 m.
-
-    Args:
-        spec: Where to add it.
-        size: Extent along x and y, in metres.
-        surface: (rows, cols) heights in metres, [row, col].
-        thickness_ratio: Thickness of the base over the elevation.
-        flat_elevation: The elevation that a flat field states, in metres; MuJoCo refuses 0.
-    """
-    # Each sub-terrain has a field of its own, and a picture of it.
-    pixels = surface.size + sum(field.nrow * field.ncol for field in spec.hfields)
-    memory = available_memory("cpu")
-    if memory is not None and pixels * _BYTES_PER_PIXEL > memory:
-        raise ValueError(
-            f"Height fields: expected at most {memory // _BYTES_PER_PIXEL:,} pixels, which is what "
-            f"{memory / 1e9:.1f} GB of memory can hold, got {pixels:,} so far; use a larger "
-            "horizontal_scale, or fewer sub-terrains."
-        )
-    low = float(surface.min())
-    span = float(surface.max()) - low
-    elevation = span if span > 0.0 else flat_elevation
-    name = asset_name(spec, "hfield")
-    hfield = spec.add_hfield(
-        name=name,
-        nrow=surface.shape[0],
-        ncol=surface.shape[1],
-        size=(
-            size[0] / 2,
-            size[1] / 2,
-            elevation,
-            max(elevation * thickness_ratio, MIN_BASE_THICKNESS),
-        ),
-        userdata=((surface - low) / elevation).ravel().tolist(),
-    )
-    geom = spec.body("terrain").add_geom(
-        type=mujoco.mjtGeom.mjGEOM_HFIELD,
-        hfieldname=name,
-        pos=(size[0] / 2, size[1] / 2, low),
-        material=color_by_height(spec, surface, name, surface),
-    )
-    return Heightfield(hfield, geom, surface, (size[0], size[1]))
-
-
-def add_noise(cfg: Any, spec: mujoco.MjSpec, noise: np.ndarray) -> Heightfield:
-    """Add a field of whole multiples of `vertical_scale`."""
-    return add_heightfield(
-        spec, cfg.size, noise * cfg.vertical_scale, cfg.base_thickness_ratio, cfg.vertical_scale
-    )
-
-
-def check_heightfield(cfg: SubTerrainCfg, *scales: str) -> None:
-    """Check what all height fields have. `scales` are fields that have to be positive."""
-    refuse_unless_positive(cfg, "horizontal_scale", "base_thickness_ratio", *scales)
-    for name, patch in (cfg.flat_patch_sampling or {}).items():
-        check_flat_patch(name, patch, cfg.size)
-
-
-def finish(
-    cfg: Any,
-    field: Heightfield,
-    spawn_height: float,
-    rng: np.random.Generator,
-    pixel: float | None = None,
-) -> TerrainOutput:
-    """Return a field and its spawn point, and draw its flat patches."""
-    low = float(field.surface.min())
-    patches = {
-        name: find_flat_patches_from_heightfield(
-            field.surface - low, pixel or cfg.horizontal_scale, low, patch, rng, size=field.size
-        )
-        for name, patch in (cfg.flat_patch_sampling or {}).items()
-    }
-    return TerrainOutput(
-        origin=np.array([field.size[0] / 2, field.size[1] / 2, spawn_height]),
-        # It keeps the colours of its texture.
-        geometries=[TerrainGeometry(geom=field.geom, hfield=field.hfield)],
-        flat_patches=patches or None,
-    )
-
-
-# MERGED mjlab.terrains.heightfield_terrains: A height field with blocks and pits. Its public home is `heightfield_terrains`.
-
-
-# Obstacles stand, and their footprints grow, in steps of this many pixels.
-_OBSTACLE_STEP = 4
-
-
-@dataclass(kw_only=True)
-class HfDiscreteObstaclesTerrainCfg(SubTerrainCfg):
-    """Blocks and pits of random sizes at random places."""
-
-    obstacle_height_mode: Literal["choice", "fixed"] = "choice"
-    """`fixed` gives every obstacle the full height; `choice` draws from the full and half height,
-    up and down."""
-    obstacle_width_range: tuple[float, float]
-    """Smallest and largest side of an obstacle, in metres."""
-    obstacle_height_range: tuple[float, float]
-    """Full height of obstacles at difficulty 0 and 1, in metres."""
-    num_obstacles: int
-    """Number of obstacles; later ones overwrite earlier ones."""
-    platform_width: float = 1.0
-    """Side of the square at the centre that is cleared, in metres."""
-    horizontal_scale: float = 0.1
-    """Size of a pixel, in metres."""
-    vertical_scale: float = 0.005
-    """Step of heights, in metres."""
-    base_thickness_ratio: float = 1.0
-    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
-    border_width: float = 0.0
-    """Width of the flat border, in metres: 0, or at least one pixel."""
-    square_obstacles: bool = False
-    """Whether obstacles are as long as they are wide."""
-    origin_z_offset: float = 0.0
-    """How far above the platform robots start, in metres."""
-
-    def function(
-        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
-    ) -> TerrainOutput:
-        """Add the terrain; robots start on the platform.
-
-        Obstacles begin at every fourth pixel inside the border, and are cut off where it ends.
-        """
-        self._check_obstacles()
-        pixels = divide_into_pixels(self)
-        refuse_unless_platform_fits(self)
-        full = int(lerp(self.obstacle_height_range, difficulty) / self.vertical_scale)
-        heights = [full] if self.obstacle_height_mode == "fixed" else _levels(full)
-        narrow, wide = (int(width / self.horizontal_scale) for width in self.obstacle_width_range)
-        sides = np.arange(narrow, wide + 1, _OBSTACLE_STEP)
-        inner = np.zeros(pixels.inner, dtype=int)
-        starts = [np.arange(0, count, _OBSTACLE_STEP) for count in pixels.inner]
-        for _ in range(self.num_obstacles):
-            height, width = rng.choice(heights), rng.choice(sides)
-            length = width if self.square_obstacles else rng.choice(sides)
-            row, col = (rng.choice(start) for start in starts)
-            inner[row : row + width, col : col + length] = height
-        noise = pixels.with_border(inner)
-        half = int(self.platform_width / self.horizontal_scale) // 2
-        row, col = pixels.rows // 2, pixels.cols // 2
-        noise[row - half : row + half, col - half : col + half] = 0
-        field = add_noise(self, spec, noise)
-        # Without a platform robots stand on whatever there is at the centre.
-        around = max(half, 1)
-        ground = field.surface[row - around : row + around, col - around : col + around].max()
-        return finish(self, field, float(ground) + self.origin_z_offset, rng)
-
-    def _check_obstacles(self) -> None:
-        """Raise `ValueError` for obstacles that cannot be made."""
-        check_heightfield(self, "vertical_scale")
-        refuse_unless(
-            self.obstacle_height_mode in ("choice", "fixed"),
-            self,
-            "obstacle_height_mode",
-            "it must be 'choice' or 'fixed'.",
-        )
-        refuse_unless_range(self, "obstacle_width_range", lowest=self.horizontal_scale)
-        refuse_unless_range(self, "obstacle_height_range", lowest=0.0)
-        refuse_unless(self.num_obstacles >= 0, self, "num_obstacles", "it must not be negative.")
-
-
-def _levels(full: int) -> list[int]:
-    """Return what `choice` draws from, in units of `vertical_scale`."""
-    return [-full, -full // 2, full // 2, full]
-
-
-# MERGED mjlab.terrains.heightfield_terrains: Fractal gradient noise.
-
-
-# Gradients by the last two bits of a hash: x + y, x - y, -x + y, -x - y.
-_SIGNS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+# Noise.
 
 
 def fractal_noise(
@@ -426,242 +573,19 @@ def _gradient_noise(x: np.ndarray, y: np.ndarray, permutation: np.ndarray) -> np
     x_cell, y_cell = np.floor(x).astype(int), np.floor(y).astype(int)
     x_in, y_in = x - x_cell, y - y_cell
     x_cell, y_cell = x_cell % 256, y_cell % 256
-    corners = [
-        [
-            _slope(permutation[permutation[x_cell + i] + y_cell + j], x_in - i, y_in - j)
-            for j in (0, 1)
-        ]
-        for i in (0, 1)
-    ]
+    corners = []
+    for i in (0, 1):
+        for j in (0, 1):
+            signs = _SIGNS[permutation[permutation[x_cell + i] + y_cell + j] % 4]
+            corners.append(signs[..., 0] * (x_in - i) + signs[..., 1] * (y_in - j))
     u, v = _fade(x_in), _fade(y_in)
-    low, high = (near + v * (far - near) for near, far in corners)
+    low = corners[0] + v * (corners[1] - corners[0])
+    high = corners[2] + v * (corners[3] - corners[2])
     return low + u * (high - low)
-
-
-def _slope(hashes: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    signs = _SIGNS[hashes % 4]
-    return signs[..., 0] * x + signs[..., 1] * y
 
 
 def _fade(t: np.ndarray) -> np.ndarray:
     return t**3 * (t * (t * 6.0 - 15.0) + 10.0)
-
-
-# A field of Perlin noise is at least this high, in metres.
-_MIN_PERLIN_HEIGHT = 0.001
-
-
-@dataclass(kw_only=True)
-class HfPyramidSlopedTerrainCfg(SubTerrainCfg):
-    """A hill with a flat top, or, inverted, a hollow with a flat bottom."""
-
-    slope_range: tuple[float, float]
-    """Rise over run along the centre lines, at difficulty 0 and 1."""
-    platform_width: float = 1.0
-    """Side of the flat square at the centre, in metres."""
-    inverted: bool = False
-    """Whether it goes down instead of up."""
-    border_width: float = 0.0
-    """Width of the flat border, in metres: 0, or at least one pixel."""
-    horizontal_scale: float = 0.1
-    """Size of a pixel, in metres."""
-    vertical_scale: float = 0.005
-    """Step of heights, in metres."""
-    base_thickness_ratio: float = 1.0
-    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
-
-    def function(
-        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
-    ) -> TerrainOutput:
-        """Add the terrain; robots start on the platform.
-
-        Heights are `peak a(x) a(y)` with `a(x) = (c - |c - x|) / c`, c half the number of pixels,
-        cut off where the platform begins.
-        """
-        check_heightfield(self, "vertical_scale")
-        pixels = divide_into_pixels(self)
-        refuse_unless_range(self, "slope_range")
-        refuse_unless_platform_fits(self)
-        slope = lerp(self.slope_range, difficulty) * (-1.0 if self.inverted else 1.0)
-        peak = int(slope * pixels.inner_size[0] / 2 / self.vertical_scale)
-        ramp_y, ramp_x = (_ramp(count) for count in pixels.inner)
-        raw = peak * ramp_y[:, None] * ramp_x[None, :]
-        half = int(self.platform_width / self.horizontal_scale / 2)
-        row, col = (max(count // 2 - half, 0) for count in pixels.inner)
-        cut = raw[row, col]
-        raw = np.clip(raw, min(cut, 0.0), max(cut, 0.0))
-        noise = pixels.with_border(np.rint(raw).astype(int))
-        field = add_noise(self, spec, noise)
-        centre = field.surface[pixels.rows // 2, pixels.cols // 2]
-        return finish(self, field, float(centre), rng)
-
-
-def _ramp(count: int) -> np.ndarray:
-    """Return a tent of `count` numbers, 0 at the start and 1 in the middle."""
-    middle = count // 2
-    return (middle - np.abs(middle - np.arange(count))) / middle
-
-
-@dataclass(kw_only=True)
-class HfRandomUniformTerrainCfg(SubTerrainCfg):
-    """Rough ground: random heights, interpolated if they are drawn more coarsely than pixels."""
-
-    noise_range: tuple[float, float]
-    """Lowest and highest height, in metres."""
-    noise_step: float = 0.005
-    """Step between possible heights, in metres; at least `vertical_scale`."""
-    downsampled_scale: float | None = None
-    """Distance between drawn heights, in metres, at least a pixel; None for one at each pixel."""
-    horizontal_scale: float = 0.1
-    """Size of a pixel, in metres."""
-    vertical_scale: float = 0.005
-    """Step of heights, in metres."""
-    base_thickness_ratio: float = 1.0
-    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
-    border_width: float = 0.0
-    """Width of the flat border, in metres: 0, or at least one pixel."""
-    scale_with_difficulty: bool = False
-    """Whether the range is multiplied by the difficulty, which otherwise changes nothing."""
-
-    def function(
-        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
-    ) -> TerrainOutput:
-        """Add the terrain; robots start at the height of the highest ground within 1 m."""
-        check_heightfield(self, "vertical_scale")
-        pixels = divide_into_pixels(self)
-        refuse_unless_range(self, "noise_range")
-        step = self._checked_step()
-        spacing = self._checked_spacing(pixels.inner_size)
-        factor = difficulty if self.scale_with_difficulty else 1.0
-        low, high = (int(factor * end / self.vertical_scale) for end in self.noise_range)
-        # The first axis is the row, that is y.
-        counts = [int(extent / spacing) for extent in pixels.inner_size[::-1]]
-        drawn = rng.choice(np.arange(low, high + step, step), size=counts)
-        noise = pixels.with_border(interpolate_cubic(drawn, pixels.inner))
-        field = add_noise(self, spec, noise)
-        return finish(self, field, field.highest_near_centre(), rng)
-
-    def _checked_step(self) -> int:
-        """Return the step of noise in units of `vertical_scale`."""
-        refuse_unless_positive(self, "noise_step")
-        step = int(self.noise_step / self.vertical_scale)
-        refuse_unless(
-            step >= 1, self, "noise_step", f"it must be at least vertical_scale = "
-            f"{self.vertical_scale:g} m, the step of heights.",
-        )  # fmt: skip
-        return step
-
-    def _checked_spacing(self, inner_size: tuple[float, float]) -> float:
-        """Return the distance between drawn heights."""
-        if self.downsampled_scale is None:
-            return self.horizontal_scale
-        refuse_unless(
-            self.downsampled_scale >= self.horizontal_scale,
-            self,
-            "downsampled_scale",
-            f"it must not be below horizontal_scale = {self.horizontal_scale:g}.",
-        )
-        refuse_unless(
-            2 * self.downsampled_scale <= min(inner_size),
-            self,
-            "downsampled_scale",
-            f"that is less than two heights along the {min(inner_size):g} m inside the border.",
-        )
-        return self.downsampled_scale
-
-
-@dataclass(kw_only=True)
-class HfWaveTerrainCfg(SubTerrainCfg):
-    """Waves along both axes, added up."""
-
-    amplitude_range: tuple[float, float]
-    """Twice the amplitude of each of the two waves at difficulty 0 and 1, in metres: half of the
-    difference between the highest and the lowest point."""
-    num_waves: int = 1
-    """Number of waves along y inside the border; along x the wavelength is the same."""
-    horizontal_scale: float = 0.1
-    """Size of a pixel, in metres."""
-    vertical_scale: float = 0.005
-    """Step of heights, in metres."""
-    base_thickness_ratio: float = 0.25
-    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
-    border_width: float = 0.0
-    """Width of the flat border, in metres: 0, or at least one pixel."""
-
-    def function(
-        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
-    ) -> TerrainOutput:
-        """Add the terrain; robots start at the height of the highest ground within 1 m.
-
-        Heights are `A (cos(2 pi n col / L) + sin(2 pi n row / L))` with L the number of rows inside
-        the border and A half the amplitude.
-        """
-        check_heightfield(self, "vertical_scale")
-        pixels = divide_into_pixels(self)
-        refuse_unless_range(self, "amplitude_range", lowest=0.0)
-        refuse_unless(self.num_waves > 0, self, "num_waves", "it must be at least 1.")
-        refuse_unless(
-            2 * self.num_waves <= pixels.inner[0],
-            self,
-            "num_waves",
-            f"{pixels.inner[0]} pixels along y can show at most {pixels.inner[0] // 2}.",
-        )
-        amplitude = int(0.5 * lerp(self.amplitude_range, difficulty) / self.vertical_scale)
-        rows, cols = pixels.inner
-        turn = 2.0 * np.pi * self.num_waves / rows
-        raw = np.sin(turn * np.arange(rows))[:, None] + np.cos(turn * np.arange(cols))[None, :]
-        noise = pixels.with_border(np.rint(amplitude * raw).astype(int))
-        field = add_noise(self, spec, noise)
-        return finish(self, field, field.highest_near_centre(), rng)
-
-
-@dataclass(kw_only=True)
-class HfPerlinNoiseTerrainCfg(SubTerrainCfg):
-    """Smooth hills of several sizes: fractal Perlin noise."""
-
-    height_range: tuple[float, float]
-    """Height of the highest point over the lowest at difficulty 0 and 1, in metres."""
-    octaves: int = 4
-    """Number of layers of noise, each finer and weaker than the one before."""
-    persistence: float = 0.5
-    """How much weaker each layer is, as a factor."""
-    lacunarity: float = 2.0
-    """How much finer each layer is, as a factor."""
-    scale: float = 10.0
-    """Number of hills of the first layer along each side, times horizontal_scale / resolution."""
-    horizontal_scale: float = 0.1
-    """Size that `scale` refers to, in metres."""
-    resolution: float = 0.05
-    """Size of a pixel, in metres."""
-    base_thickness_ratio: float = 1.0
-    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
-    border_width: float = 0.0
-    """Width of the flat border, in metres: 0, or at least one pixel."""
-
-    def function(
-        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
-    ) -> TerrainOutput:
-        """Add the terrain; robots start at the height of the highest ground within 1 m."""
-        check_heightfield(self, "scale", "lacunarity", "resolution")
-        refuse_unless(self.octaves >= 1, self, "octaves", "it must be at least 1.")
-        refuse_unless(self.persistence >= 0.0, self, "persistence", "it must not be negative.")
-        refuse_unless_range(self, "height_range", lowest=0.0)
-        pixels = divide_into_pixels(self, "resolution")
-        frequency = self.scale * self.resolution / self.horizontal_scale
-        refuse_unless(
-            2 * frequency <= min(pixels.inner),
-            self,
-            "scale",
-            f"that makes {frequency:g} hills along each side, but {min(pixels.inner)} pixels can "
-            f"show at most {min(pixels.inner) // 2}.",
-        )
-        noise = fractal_noise(
-            pixels.inner, frequency, self.octaves, self.persistence, self.lacunarity, rng
-        )
-        height = max(lerp(self.height_range, difficulty), _MIN_PERLIN_HEIGHT)
-        surface = pixels.with_border(noise) * height
-        field = add_heightfield(spec, self.size, surface, self.base_thickness_ratio, height)
-        return finish(self, field, field.highest_near_centre(), rng, pixel=self.resolution)
 
 
 __getattr__ = older_names(__name__)

@@ -1,4 +1,4 @@
-"""Sub-terrains made of boxes (and of convex columns)."""
+"""Sub-terrains made of boxes (and of convex columns): stairs, grids, obstacles, and over a pit."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from mjlab.terrains._fields import lerp, refuse_unless, refuse_unless_positive, refuse_unless_range
 from mjlab.terrains.boxes import (
     BLUE,
     GREEN,
@@ -22,16 +21,346 @@ from mjlab.terrains.boxes import (
     merge_equal_cells,
 )
 from mjlab.terrains.terrain_generator import SubTerrainCfg, TerrainOutput, asset_name
+from mjlab.terrains.utils import lerp
 from mjlab.utils.color import brand_ramp
-
-# MERGED mjlab.terrains.primitive_terrains: Sub-terrains that are a grid of cells: level ones of random height, or tilted ones.
-
+from mjlab.utils.errors import (
+    WrongStateError,
+    check_field,
+    check_field_range,
+    check_fields_positive,
+)
 
 # What rounding errors may add to the edges of cells, in metres.
 _TOLERANCE = 1e-9
 
 # Height of frame and platform of a tilted grid, in metres.
 _TILTED_HEIGHT = 0.2
+
+# Stones that the frame leaves less than this are dropped, in metres.
+_MIN_STONE = 0.05
+
+# Beams shorter than this are dropped, in metres: the platform reaches the frame there.
+_MIN_BEAM = 0.01
+
+
+@dataclass(kw_only=True)
+class BoxFlatTerrainCfg(SubTerrainCfg):
+    """Flat ground at z = 0, at every difficulty."""
+
+    def function(
+        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
+    ) -> TerrainOutput:
+        """See `SubTerrainCfg.function`."""
+        boxes = Boxes(spec, self.size)
+        boxes.add_platform(self.size, 0.0, (0.5, 0.5, 0.5, 1.0), bottom=-1.0)
+        return boxes.output(0.0)
+
+
+# Stairs in square rings, which rise or fall towards a platform in the middle.
+
+
+@dataclass(kw_only=True)
+class BoxPyramidStairsTerrainCfg(SubTerrainCfg):
+    """Stairs that rise from all sides to a platform.
+
+    A harder terrain has higher steps. The platform is one step above the last.
+    """
+
+    border_width: float = 0.0
+    """Width of the flat frame around the stairs, in metres."""
+    step_height_range: tuple[float, float]
+    """Height of a step at difficulty 0 and 1, in metres."""
+    step_width: float
+    """Depth of a step, in metres."""
+    platform_width: float = 1.0
+    """Least extent of the platform, in metres."""
+    holes: bool = False
+    """Whether steps are only as long as the platform is wide, with nothing at the corners."""
+
+    def function(
+        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
+    ) -> TerrainOutput:
+        """See `SubTerrainCfg.function`."""
+        return self._make(difficulty, spec, BLUE, direction=1)
+
+    def _make(
+        self,
+        difficulty: float,
+        spec: mujoco.MjSpec,
+        base: tuple[float, float, float],
+        direction: int,
+    ) -> TerrainOutput:
+        """Make stairs that rise (direction 1) or fall (-1) towards the middle."""
+        check_fields_positive(self, "step_width")
+        boxes = Boxes(spec, self.size)
+        height = lerp(self.step_height_range, difficulty)
+        inner = inset(self.size, self.border_width)
+        count = _count_steps(inner, self.platform_width, self.step_width)
+        if not self.holes:
+            boxes.add_frame(self.border_width, 0.0, frame_color(base), bottom=-height)
+        last = direction * (count + 1) * height
+        # Steps that rise reach below the ground around them, those that fall to the platform.
+        bottom = -height if direction > 0 else last
+        for step in range(count):
+            boxes.add_ring(
+                inset(inner, step * self.step_width),
+                self.step_width,
+                direction * (step + 1) * height,
+                _shade(base, step, count),
+                bottom=bottom,
+                arms=self.platform_width if self.holes else None,
+            )
+        platform = inset(inner, count * self.step_width)
+        boxes.add_platform(platform, last, brand_ramp(base, 1.0), bottom=bottom)
+        return boxes.output(last)
+
+
+@dataclass(kw_only=True)
+class BoxInvertedPyramidStairsTerrainCfg(BoxPyramidStairsTerrainCfg):
+    """Stairs that fall from all sides to a platform."""
+
+    def function(
+        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
+    ) -> TerrainOutput:
+        """See `SubTerrainCfg.function`."""
+        return self._make(difficulty, spec, RED, direction=-1)
+
+
+@dataclass(kw_only=True)
+class BoxOpenStairsTerrainCfg(SubTerrainCfg):
+    """Stairs of slabs with nothing below them.
+
+    A harder terrain has steps that are higher and not as deep.
+    """
+
+    step_height_range: tuple[float, float] = (0.1, 0.2)
+    """Height of a step at difficulty 0 and 1, in metres."""
+    step_width_range: tuple[float, float] = (0.4, 0.8)
+    """Depth of a step at difficulty 1 and 0, in metres."""
+    platform_width: float = 1.0
+    """Least extent of the platform in the middle, in metres."""
+    border_width: float = 0.25
+    """Width of the flat frame around the stairs, in metres."""
+    step_thickness: float = 0.05
+    """Thickness of the slabs, in metres."""
+    inverted: bool = True
+    """Whether the stairs fall towards the platform. The first step is then level with the frame,
+    and the platform one step below the last."""
+
+    def function(
+        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
+    ) -> TerrainOutput:
+        """See `SubTerrainCfg.function`."""
+        check_fields_positive(self, "step_thickness")
+        check_field(self, "step_width_range", min(self.step_width_range) > 0.0, "widths > 0")
+        boxes = Boxes(spec, self.size)
+        height = lerp(self.step_height_range, difficulty)
+        width = lerp(self.step_width_range[::-1], difficulty)
+        inner = inset(self.size, self.border_width)
+        count = _count_steps(inner, self.platform_width, width)
+        boxes.add_frame(self.border_width, 0.0, frame_color(BLUE), bottom=-height)
+        tops = [-k * height if self.inverted else (k + 1) * height for k in range(count + 1)]
+        for step in range(count):
+            boxes.add_ring(
+                inset(inner, step * width), width, tops[step], _shade(BLUE, step, count),
+                slab=self.step_thickness,
+            )  # fmt: skip
+        top = tops[count]
+        boxes.add(
+            boxes.center, inset(inner, count * width), top, brand_ramp(BLUE, 1.0),
+            slab=self.step_thickness,
+        )  # fmt: skip
+        return boxes.output(top)
+
+
+@dataclass(kw_only=True)
+class BoxRandomStairsTerrainCfg(SubTerrainCfg):
+    """Stairs that rise to a platform, each step by another height.
+
+    A harder terrain has higher steps: half of the drawn height at difficulty 0, all of it at 1.
+    """
+
+    step_width: float = 0.8
+    """Depth of a step, in metres."""
+    step_height_range: tuple[float, float] = (0.1, 0.3)
+    """Range from which the height of each step is drawn, in metres."""
+    platform_width: float = 1.0
+    """Least extent of the platform in the middle, in metres. It is level with the last step."""
+    border_width: float = 0.25
+    """Width of the flat frame around the stairs, in metres."""
+
+    def function(
+        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
+    ) -> TerrainOutput:
+        """See `SubTerrainCfg.function`."""
+        check_fields_positive(self, "step_width")
+        boxes = Boxes(spec, self.size)
+        inner = inset(self.size, self.border_width)
+        count = _count_steps(inner, self.platform_width, self.step_width)
+        boxes.add_frame(self.border_width, 0.0, frame_color(BLUE))
+        top = 0.0
+        for step in range(count):
+            top += float(rng.uniform(*self.step_height_range)) * (0.5 + 0.5 * difficulty)
+            extent = inset(inner, step * self.step_width)
+            shade = _shade(BLUE, step, count)
+            boxes.add_ring(extent, self.step_width, top, shade, bottom=-MIN_THICKNESS)
+        platform = inset(inner, count * self.step_width)
+        boxes.add_platform(platform, top, brand_ramp(BLUE, 1.0), bottom=-MIN_THICKNESS)
+        return boxes.output(top)
+
+
+def _count_steps(inner: tuple[float, float], platform: float, step_width: float) -> int:
+    """Return how many rings of steps fit between the frame and the platform."""
+    return max(0, min(int((side - platform) / (2.0 * step_width)) for side in inner))
+
+
+def _shade(base: tuple[float, float, float], step: int, count: int) -> RGBA:
+    return brand_ramp(base, step / max(count - 1, 1))
+
+
+# Grids of cells: level ones of random height, or tilted ones.
+
+
+@dataclass(kw_only=True)
+class BoxRandomGridTerrainCfg(SubTerrainCfg):
+    """A grid of square columns of random height, around a platform as high as they get.
+
+    A harder terrain has larger differences in height. The size must be square.
+    """
+
+    grid_width: float
+    """Extent of a column along x and y, in metres."""
+    grid_height_range: tuple[float, float]
+    """Largest height of a column at difficulty 0 and 1, in metres; heights are drawn between that
+    below zero and that above."""
+    platform_width: float = 1.0
+    """Extent of the platform in the middle, in metres."""
+    holes: bool = False
+    """Whether only the columns of a cross are kept, which is as wide as the platform."""
+    merge_similar_heights: bool = False
+    """Whether neighbours of about the same height become one box, for fewer geoms."""
+    height_merge_threshold: float = 0.05
+    """Multiple to which heights are rounded before merging, in metres."""
+    max_merge_distance: int = 3
+    """Most columns along x and y that become one box."""
+    border_width: float = 0.25
+    """Least width of the flat frame around the grid, in metres."""
+
+    def function(
+        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
+    ) -> TerrainOutput:
+        """See `SubTerrainCfg.function`.
+
+        Raises:
+            RuntimeError: columns fill the whole terrain and leave no frame.
+            ValueError: a field makes no sense.
+        """
+        check_field(self, "size", self.size[0] == self.size[1], "a square")
+        check_field(self, "grid_height_range", min(self.grid_height_range) >= 0.0, "heights >= 0")
+        check_fields_positive(self, "height_merge_threshold", "max_merge_distance")
+        boxes = Boxes(spec, self.size)
+        grid = _lay_out(self, boxes.center)
+        if min(grid.frame) <= _TOLERANCE:
+            raise WrongStateError(
+                f"BoxRandomGridTerrainCfg: {grid.counts[0]} columns of grid_width "
+                f"{self.grid_width} m fill the size of {self.size[0]} m and leave no frame. "
+                "Give a border_width, or another grid_width."
+            )
+        boxes.add_frame(grid.frame, 0.0, frame_color(GREEN), bottom=-1.0)
+        highest = lerp(self.grid_height_range, difficulty)
+        heights = rng.uniform(-highest, highest, grid.counts)
+        merge = self.merge_similar_heights and not self.holes
+        if merge:
+            threshold = self.height_merge_threshold
+            # Rounding must not lift a column that the platform hides in part above it.
+            rounded = np.round(heights / threshold) * threshold
+            heights = np.clip(rounded, -highest, highest)
+        kept = [
+            not grid.is_under_platform(i, j) and (not self.holes or grid.is_in_cross(i, j))
+            for i, j in grid.cells()
+        ]
+        kept = np.array(kept).reshape(grid.counts)
+        for i, j, num_x, num_y in merge_equal_cells(
+            heights, kept, self.max_merge_distance if merge else 1
+        ):
+            x, y = grid.place(i, j)
+            shift_x, shift_y = (num_x - 1) * grid.width / 2, (num_y - 1) * grid.width / 2
+            height = float(heights[i, j])
+            shade = 0.5 if highest == 0.0 else (height + highest) / (2.0 * highest)
+            boxes.add(
+                (x + shift_x, y + shift_y), (num_x * grid.width, num_y * grid.width), height,
+                brand_ramp(GREEN, float(np.clip(shade, 0.0, 1.0))), bottom=-1.0,
+            )  # fmt: skip
+        platform = (self.platform_width, self.platform_width)
+        boxes.add_platform(platform, highest, brand_ramp(GREEN, 1.0), bottom=-1.0)
+        return boxes.output(highest)
+
+
+@dataclass(kw_only=True)
+class BoxTiltedGridTerrainCfg(SubTerrainCfg):
+    """A grid of square columns over a pit, with tilted tops, around a level platform.
+
+    A harder terrain has larger tilts and differences in height.
+    """
+
+    grid_width: float = 1.0
+    """Extent of a column along x and y, in metres."""
+    tilt_range_deg: float = 15.0
+    """Largest tilt about x and about y at difficulty 1, in degrees."""
+    height_range: float = 0.1
+    """Range of heights at difficulty 1, in metres, about that of the platform."""
+    platform_width: float = 1.0
+    """Extent of the platform in the middle, in metres."""
+    border_width: float = 0.25
+    """Least width of the flat frame around the grid, in metres."""
+    floor_depth: float = 2.0
+    """Depth of the pit, in metres."""
+
+    def function(
+        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
+    ) -> TerrainOutput:
+        """See `SubTerrainCfg.function`."""
+        check_fields_positive(self, "floor_depth")
+        boxes = Boxes(spec, self.size)
+        grid = _lay_out(self, boxes.center)
+        dark, bottom = frame_color(GREEN), -self.floor_depth
+        boxes.add_pit(grid.frame, _TILTED_HEIGHT, dark, self.floor_depth)
+        platform = (self.platform_width, self.platform_width)
+        boxes.add_platform(platform, _TILTED_HEIGHT, dark, bottom=bottom)
+        name = asset_name(spec, "tilted_column")
+        for i, j in grid.cells():
+            if not grid.is_under_platform(i, j):
+                self._add_column(boxes, spec, grid, (i, j), f"{name}_{i}_{j}", difficulty, rng)
+        return boxes.output(_TILTED_HEIGHT)
+
+    def _add_column(
+        self,
+        boxes: Boxes,
+        spec: mujoco.MjSpec,
+        grid: _Grid,
+        cell: tuple[int, int],
+        name: str,
+        difficulty: float,
+        rng: np.random.Generator,
+    ) -> None:
+        tilt = math.radians(self.tilt_range_deg * difficulty)
+        rise = rng.uniform(-self.height_range / 2, self.height_range / 2) * difficulty
+        slopes = rng.uniform(-tilt, tilt, 2)
+        shade = float(rng.uniform(0.3, 0.7))
+        corners = np.array([(x, y) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]) * grid.width
+        tops = _TILTED_HEIGHT + rise + corners @ slopes
+        if grid.touches_platform(*cell):
+            # A column that reaches under the platform must not come out of it.
+            tops -= max(tops.max() - _TILTED_HEIGHT, 0.0)
+        bottoms = np.full(4, -self.floor_depth)
+        points = np.concatenate(
+            (np.column_stack((corners, bottoms)), np.column_stack((corners, tops)))
+        )
+        spec.add_mesh(name=name, uservert=points.ravel())
+        geom = boxes.body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, pos=(*grid.place(*cell), 0.0)
+        )
+        boxes.keep(geom, brand_ramp(GREEN, shade))
 
 
 @dataclass(frozen=True)
@@ -84,11 +413,9 @@ class _Grid:
 def _lay_out(
     cfg: BoxRandomGridTerrainCfg | BoxTiltedGridTerrainCfg, center: tuple[float, float]
 ) -> _Grid:
-    refuse_unless_positive(cfg, "grid_width")
+    check_fields_positive(cfg, "grid_width")
     counts = tuple(int((side - 2.0 * cfg.border_width) / cfg.grid_width) for side in cfg.size)
-    refuse_unless(
-        min(counts) >= 1, cfg, "grid_width", "no cell of that width fits between the borders."
-    )
+    check_field(cfg, "grid_width", min(counts) >= 1, "a width of which a cell fits in the borders")
     frame = tuple(
         (side - count * cfg.grid_width) / 2 for side, count in zip(cfg.size, counts, strict=True)
     )
@@ -97,156 +424,7 @@ def _lay_out(
     )
 
 
-@dataclass(kw_only=True)
-class BoxRandomGridTerrainCfg(SubTerrainCfg):
-    """A grid of square columns of random height, around a platform as high as they get.
-
-    A harder terrain has larger differences in height. The size must be square.
-    """
-
-    grid_width: float
-    """Extent of a column along x and y, in metres."""
-    grid_height_range: tuple[float, float]
-    """Largest height of a column at difficulty 0 and 1, in metres; heights are drawn between that
-    below zero and that above."""
-    platform_width: float = 1.0
-    """Extent of the platform in the middle, in metres."""
-    holes: bool = False
-    """Whether only the columns of a cross are kept, which is as wide as the platform."""
-    merge_similar_heights: bool = False
-    """Whether neighbours of about the same height become one box, for fewer geoms."""
-    height_merge_threshold: float = 0.05
-    """Multiple to which heights are rounded before merging, in metres."""
-    max_merge_distance: int = 3
-    """Most columns along x and y that become one box."""
-    border_width: float = 0.25
-    """Least width of the flat frame around the grid, in metres."""
-
-    def function(
-        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
-    ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`.
-
-        Raises:
-            RuntimeError: columns fill the whole terrain and leave no frame.
-            ValueError: a field makes no sense.
-        """
-        grid, boxes = self._check(spec)
-        boxes.add_frame(grid.frame, 0.0, frame_color(GREEN), bottom=-1.0)
-        highest = lerp(self.grid_height_range, difficulty)
-        heights = rng.uniform(-highest, highest, grid.counts)
-        merge = self.merge_similar_heights and not self.holes
-        if merge:
-            threshold = self.height_merge_threshold
-            # Rounding must not lift a column that the platform hides in part above it.
-            rounded = np.round(heights / threshold) * threshold
-            heights = np.clip(rounded, -highest, highest)
-        kept = np.array([self._keeps(grid, i, j) for i, j in grid.cells()]).reshape(grid.counts)
-        for i, j, num_x, num_y in merge_equal_cells(
-            heights, kept, self.max_merge_distance if merge else 1
-        ):
-            x, y = grid.place(i, j)
-            shift_x, shift_y = (num_x - 1) * grid.width / 2, (num_y - 1) * grid.width / 2
-            height = float(heights[i, j])
-            shade = 0.5 if highest == 0.0 else (height + highest) / (2.0 * highest)
-            boxes.add(
-                (x + shift_x, y + shift_y), (num_x * grid.width, num_y * grid.width), height,
-                brand_ramp(GREEN, float(np.clip(shade, 0.0, 1.0))), bottom=-1.0,
-            )  # fmt: skip
-        platform = (self.platform_width, self.platform_width)
-        boxes.add_platform(platform, highest, brand_ramp(GREEN, 1.0), bottom=-1.0)
-        return boxes.output(highest)
-
-    def _check(self, spec: mujoco.MjSpec) -> tuple[_Grid, Boxes]:
-        refuse_unless(self.size[0] == self.size[1], self, "size", "a random grid must be square.")
-        refuse_unless(
-            min(self.grid_height_range) >= 0.0, self, "grid_height_range", "it must not be below 0."
-        )
-        refuse_unless_positive(self, "height_merge_threshold", "max_merge_distance")
-        boxes = Boxes(spec, self.size)
-        grid = _lay_out(self, boxes.center)
-        if min(grid.frame) <= _TOLERANCE:
-            raise RuntimeError(
-                f"BoxRandomGridTerrainCfg: {grid.counts[0]} columns of grid_width "
-                f"{self.grid_width} m fill the size of {self.size[0]} m and leave no frame. "
-                "Give a border_width, or another grid_width."
-            )
-        return grid, boxes
-
-    def _keeps(self, grid: _Grid, i: int, j: int) -> bool:
-        if grid.is_under_platform(i, j):
-            return False
-        return grid.is_in_cross(i, j) if self.holes else True
-
-
-@dataclass(kw_only=True)
-class BoxTiltedGridTerrainCfg(SubTerrainCfg):
-    """A grid of square columns over a pit, with tilted tops, around a level platform.
-
-    A harder terrain has larger tilts and differences in height.
-    """
-
-    grid_width: float = 1.0
-    """Extent of a column along x and y, in metres."""
-    tilt_range_deg: float = 15.0
-    """Largest tilt about x and about y at difficulty 1, in degrees."""
-    height_range: float = 0.1
-    """Range of heights at difficulty 1, in metres, about that of the platform."""
-    platform_width: float = 1.0
-    """Extent of the platform in the middle, in metres."""
-    border_width: float = 0.25
-    """Least width of the flat frame around the grid, in metres."""
-    floor_depth: float = 2.0
-    """Depth of the pit, in metres."""
-
-    def function(
-        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
-    ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`."""
-        refuse_unless_positive(self, "floor_depth")
-        boxes = Boxes(spec, self.size)
-        grid = _lay_out(self, boxes.center)
-        dark, bottom = frame_color(GREEN), -self.floor_depth
-        boxes.add_pit(grid.frame, _TILTED_HEIGHT, dark, self.floor_depth)
-        platform = (self.platform_width, self.platform_width)
-        boxes.add_platform(platform, _TILTED_HEIGHT, dark, bottom=bottom)
-        name = asset_name(spec, "tilted_column")
-        for i, j in grid.cells():
-            if not grid.is_under_platform(i, j):
-                self._add_column(boxes, spec, grid, (i, j), f"{name}_{i}_{j}", difficulty, rng)
-        return boxes.output(_TILTED_HEIGHT)
-
-    def _add_column(
-        self,
-        boxes: Boxes,
-        spec: mujoco.MjSpec,
-        grid: _Grid,
-        cell: tuple[int, int],
-        name: str,
-        difficulty: float,
-        rng: np.random.Generator,
-    ) -> None:
-        tilt = math.radians(self.tilt_range_deg * difficulty)
-        rise = rng.uniform(-self.height_range / 2, self.height_range / 2) * difficulty
-        slopes = rng.uniform(-tilt, tilt, 2)
-        shade = float(rng.uniform(0.3, 0.7))
-        corners = np.array([(x, y) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]) * grid.width
-        tops = _TILTED_HEIGHT + rise + corners @ slopes
-        if grid.touches_platform(*cell):
-            # A column that reaches under the platform must not come out of it.
-            tops -= max(tops.max() - _TILTED_HEIGHT, 0.0)
-        bottoms = np.full(4, -self.floor_depth)
-        points = np.concatenate(
-            (np.column_stack((corners, bottoms)), np.column_stack((corners, tops)))
-        )
-        spec.add_mesh(name=name, uservert=points.ravel())
-        geom = boxes.body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, pos=(*grid.place(*cell), 0.0)
-        )
-        boxes.keep(geom, brand_ramp(GREEN, shade))
-
-
-# MERGED mjlab.terrains.primitive_terrains: A sub-terrain of boxes that lie about on flat ground.
+# Boxes on flat ground.
 
 
 @dataclass(kw_only=True)
@@ -277,7 +455,11 @@ class BoxRandomSpreadTerrainCfg(SubTerrainCfg):
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
         """See `SubTerrainCfg.function`."""
-        self._check()
+        for field in ("box_width_range", "box_length_range", "box_height_range"):
+            check_field_range(self, field, lowest=0.0)
+            check_field(self, field, getattr(self, field)[0] > 0.0, "lengths > 0")
+        check_field_range(self, "box_yaw_range")
+        check_field(self, "num_boxes", self.num_boxes >= 0, "a number >= 0")
         boxes = Boxes(spec, self.size)
         boxes.add_frame(self.border_width, 0.0, frame_color(BLUE), bottom=-1.0)
         inner = inset(self.size, self.border_width)
@@ -286,13 +468,6 @@ class BoxRandomSpreadTerrainCfg(SubTerrainCfg):
         for _ in range(int(self.num_boxes * (0.5 + 0.5 * difficulty))):
             self._add_obstacle(boxes, inner, difficulty, rng)
         return boxes.output(0.0)
-
-    def _check(self) -> None:
-        for field in ("box_width_range", "box_length_range", "box_height_range"):
-            refuse_unless_range(self, field, lowest=0.0)
-            refuse_unless(getattr(self, field)[0] > 0.0, self, field, "it must be above 0.")
-        refuse_unless_range(self, "box_yaw_range")
-        refuse_unless(self.num_boxes >= 0, self, "num_boxes", "it must not be negative.")
 
     def _add_obstacle(
         self,
@@ -341,14 +516,7 @@ def _touches_square(center: np.ndarray, length: np.ndarray, yaw: float, side: fl
     return bool((abs(along) <= (square + length) / 2).all())
 
 
-# MERGED mjlab.terrains.primitive_terrains: Sub-terrains over a pit: stepping stones, beams, and nested rings.
-
-
-# Stones that the frame leaves less than this are dropped, in metres.
-_MIN_STONE = 0.05
-
-# Beams shorter than this are dropped, in metres: the platform reaches the frame there.
-_MIN_BEAM = 0.01
+# Over a pit: stepping stones, beams, and nested rings.
 
 
 @dataclass(kw_only=True)
@@ -382,14 +550,15 @@ class BoxSteppingStonesTerrainCfg(SubTerrainCfg):
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
         """See `SubTerrainCfg.function`."""
-        refuse_unless_positive(self, "floor_depth")
-        refuse_unless_range(self, "stone_size_range", lowest=0.0)
-        refuse_unless(self.stone_size_range[1] > 0.0, self, "stone_size_range", "above 0")
+        check_fields_positive(self, "floor_depth")
+        check_field_range(self, "stone_size_range", lowest=0.0)
+        check_field(self, "stone_size_range", self.stone_size_range[1] > 0.0, "lengths > 0")
         boxes = Boxes(spec, self.size)
         side = lerp(self.stone_size_range[::-1], difficulty)
         inner = np.array(inset(self.size, self.border_width))
         pitch_least = self.stone_size_range[1] + self.stone_distance_range[0]
-        refuse_unless(pitch_least > 0.0, self, "stone_distance_range", "stones overlap.")
+        least_gap = f"a first value > {-self.stone_size_range[1]:g}"
+        check_field(self, "stone_distance_range", pitch_least > 0.0, least_gap)
         counts = np.maximum(2, np.floor(inner / pitch_least).astype(int) + 1)
         pitch = inner / (counts - 1)
         reach = self._platform_reach(side, inner, counts, pitch)
@@ -470,9 +639,9 @@ class BoxNarrowBeamsTerrainCfg(SubTerrainCfg):
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
         """See `SubTerrainCfg.function`."""
-        refuse_unless_positive(self, "floor_depth")
-        refuse_unless_range(self, "beam_width_range", lowest=0.0)
-        refuse_unless(self.beam_width_range[0] > 0.0, self, "beam_width_range", "above 0")
+        check_fields_positive(self, "floor_depth")
+        check_field_range(self, "beam_width_range", lowest=0.0)
+        check_field(self, "beam_width_range", self.beam_width_range[0] > 0.0, "widths > 0")
         boxes = Boxes(spec, self.size)
         width = lerp(self.beam_width_range[::-1], difficulty)
         radius = self.platform_width / 2
@@ -538,10 +707,10 @@ class BoxNestedRingsTerrainCfg(SubTerrainCfg):
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
         """See `SubTerrainCfg.function`."""
-        refuse_unless_positive(self, "floor_depth")
-        refuse_unless_range(self, "ring_width_range", lowest=0.0)
-        refuse_unless(self.ring_width_range[0] > 0.0, self, "ring_width_range", "above 0")
-        refuse_unless_range(self, "gap_range", lowest=0.0)
+        check_fields_positive(self, "floor_depth")
+        check_field_range(self, "ring_width_range", lowest=0.0)
+        check_field(self, "ring_width_range", self.ring_width_range[0] > 0.0, "widths > 0")
+        check_field_range(self, "gap_range", lowest=0.0)
         boxes = Boxes(spec, self.size)
         width = lerp(self.ring_width_range[::-1], difficulty)
         gap = lerp(self.gap_range, difficulty)
@@ -555,180 +724,3 @@ class BoxNestedRingsTerrainCfg(SubTerrainCfg):
         pad = max(outer[0] + 2.0 * gap, 0.01), max(outer[1] + 2.0 * gap, 0.01)
         boxes.add_platform(pad, top, dark, bottom=bottom)
         return boxes.output(top)
-
-
-# MERGED mjlab.terrains.primitive_terrains: Sub-terrains of stairs, which rise or fall in square rings towards a platform in the middle.
-
-
-def _count_steps(inner: tuple[float, float], platform: float, step_width: float) -> int:
-    """Return how many rings of steps fit between the frame and the platform."""
-    return max(0, min(int((side - platform) / (2.0 * step_width)) for side in inner))
-
-
-def _shade(base: tuple[float, float, float], step: int, count: int) -> RGBA:
-    return brand_ramp(base, step / max(count - 1, 1))
-
-
-@dataclass(kw_only=True)
-class BoxPyramidStairsTerrainCfg(SubTerrainCfg):
-    """Stairs that rise from all sides to a platform.
-
-    A harder terrain has higher steps. The platform is one step above the last.
-    """
-
-    border_width: float = 0.0
-    """Width of the flat frame around the stairs, in metres."""
-    step_height_range: tuple[float, float]
-    """Height of a step at difficulty 0 and 1, in metres."""
-    step_width: float
-    """Depth of a step, in metres."""
-    platform_width: float = 1.0
-    """Least extent of the platform, in metres."""
-    holes: bool = False
-    """Whether steps are only as long as the platform is wide, with nothing at the corners."""
-
-    def function(
-        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
-    ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`."""
-        return self._make(difficulty, spec, BLUE, direction=1)
-
-    def _make(
-        self,
-        difficulty: float,
-        spec: mujoco.MjSpec,
-        base: tuple[float, float, float],
-        direction: int,
-    ) -> TerrainOutput:
-        """Make stairs that rise (direction 1) or fall (-1) towards the middle."""
-        refuse_unless_positive(self, "step_width")
-        boxes = Boxes(spec, self.size)
-        height = lerp(self.step_height_range, difficulty)
-        inner = inset(self.size, self.border_width)
-        count = _count_steps(inner, self.platform_width, self.step_width)
-        if not self.holes:
-            boxes.add_frame(self.border_width, 0.0, frame_color(base), bottom=-height)
-        last = direction * (count + 1) * height
-        # Steps that rise reach below the ground around them, those that fall to the platform.
-        bottom = -height if direction > 0 else last
-        for step in range(count):
-            boxes.add_ring(
-                inset(inner, step * self.step_width),
-                self.step_width,
-                direction * (step + 1) * height,
-                _shade(base, step, count),
-                bottom=bottom,
-                arms=self.platform_width if self.holes else None,
-            )
-        platform = inset(inner, count * self.step_width)
-        boxes.add_platform(platform, last, brand_ramp(base, 1.0), bottom=bottom)
-        return boxes.output(last)
-
-
-@dataclass(kw_only=True)
-class BoxInvertedPyramidStairsTerrainCfg(BoxPyramidStairsTerrainCfg):
-    """Stairs that fall from all sides to a platform."""
-
-    def function(
-        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
-    ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`."""
-        return self._make(difficulty, spec, RED, direction=-1)
-
-
-@dataclass(kw_only=True)
-class BoxOpenStairsTerrainCfg(SubTerrainCfg):
-    """Stairs of slabs with nothing below them.
-
-    A harder terrain has steps that are higher and not as deep.
-    """
-
-    step_height_range: tuple[float, float] = (0.1, 0.2)
-    """Height of a step at difficulty 0 and 1, in metres."""
-    step_width_range: tuple[float, float] = (0.4, 0.8)
-    """Depth of a step at difficulty 1 and 0, in metres."""
-    platform_width: float = 1.0
-    """Least extent of the platform in the middle, in metres."""
-    border_width: float = 0.25
-    """Width of the flat frame around the stairs, in metres."""
-    step_thickness: float = 0.05
-    """Thickness of the slabs, in metres."""
-    inverted: bool = True
-    """Whether the stairs fall towards the platform. The first step is then level with the frame,
-    and the platform one step below the last."""
-
-    def function(
-        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
-    ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`."""
-        refuse_unless_positive(self, "step_thickness")
-        refuse_unless(min(self.step_width_range) > 0.0, self, "step_width_range", "above 0")
-        boxes = Boxes(spec, self.size)
-        height = lerp(self.step_height_range, difficulty)
-        width = lerp(self.step_width_range[::-1], difficulty)
-        inner = inset(self.size, self.border_width)
-        count = _count_steps(inner, self.platform_width, width)
-        boxes.add_frame(self.border_width, 0.0, frame_color(BLUE), bottom=-height)
-        for step in range(count):
-            boxes.add_ring(
-                inset(inner, step * width), width, self._top(step, height),
-                _shade(BLUE, step, count), slab=self.step_thickness,
-            )  # fmt: skip
-        top = self._top(count, height)
-        boxes.add(
-            boxes.center, inset(inner, count * width), top, brand_ramp(BLUE, 1.0),
-            slab=self.step_thickness,
-        )  # fmt: skip
-        return boxes.output(top)
-
-    def _top(self, step: int, height: float) -> float:
-        return -step * height if self.inverted else (step + 1) * height
-
-
-@dataclass(kw_only=True)
-class BoxRandomStairsTerrainCfg(SubTerrainCfg):
-    """Stairs that rise to a platform, each step by another height.
-
-    A harder terrain has higher steps: half of the drawn height at difficulty 0, all of it at 1.
-    """
-
-    step_width: float = 0.8
-    """Depth of a step, in metres."""
-    step_height_range: tuple[float, float] = (0.1, 0.3)
-    """Range from which the height of each step is drawn, in metres."""
-    platform_width: float = 1.0
-    """Least extent of the platform in the middle, in metres. It is level with the last step."""
-    border_width: float = 0.25
-    """Width of the flat frame around the stairs, in metres."""
-
-    def function(
-        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
-    ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`."""
-        refuse_unless_positive(self, "step_width")
-        boxes = Boxes(spec, self.size)
-        inner = inset(self.size, self.border_width)
-        count = _count_steps(inner, self.platform_width, self.step_width)
-        boxes.add_frame(self.border_width, 0.0, frame_color(BLUE))
-        top = 0.0
-        for step in range(count):
-            top += float(rng.uniform(*self.step_height_range)) * (0.5 + 0.5 * difficulty)
-            extent = inset(inner, step * self.step_width)
-            shade = _shade(BLUE, step, count)
-            boxes.add_ring(extent, self.step_width, top, shade, bottom=-MIN_THICKNESS)
-        platform = inset(inner, count * self.step_width)
-        boxes.add_platform(platform, top, brand_ramp(BLUE, 1.0), bottom=-MIN_THICKNESS)
-        return boxes.output(top)
-
-
-@dataclass(kw_only=True)
-class BoxFlatTerrainCfg(SubTerrainCfg):
-    """Flat ground at z = 0, at every difficulty."""
-
-    def function(
-        self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
-    ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`."""
-        boxes = Boxes(spec, self.size)
-        boxes.add_platform(self.size, 0.0, (0.5, 0.5, 0.5, 1.0), bottom=-1.0)
-        return boxes.output(0.0)

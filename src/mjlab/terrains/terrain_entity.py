@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal, NoReturn
@@ -16,69 +16,9 @@ import torch
 from mjlab.entity import Entity, EntityCfg
 from mjlab.terrains.terrain_generator import TerrainGenerator, TerrainGeneratorCfg
 from mjlab.utils import spec_config as spec_cfg
+from mjlab.utils.errors import WrongTypeError, check_one_of
 
-# MERGED mjlab.terrains.terrain_entity: Where environments are: a grid on flat ground, or the cells of a generated terrain.
-
-
-def grid_origins(num_envs: int, spacing: float, device: str) -> torch.Tensor:
-    """Return (num_envs, 3) origins on a square grid, centred on the world's origin.
-
-    With `rows = ceil(N / floor(sqrt N))` and `cols = ceil(N / rows)`, environment k is in row
-    `i = k div cols` and column `j = k mod cols`, at
-    `(-(i - (rows - 1) / 2) s, (j - (cols - 1) / 2) s, 0)`.
-    """
-    num_rows = math.ceil(num_envs / math.isqrt(num_envs))
-    num_cols = math.ceil(num_envs / num_rows)
-    index = torch.arange(num_envs, device=device)
-    row = torch.div(index, num_cols, rounding_mode="floor")
-    origins = torch.zeros(num_envs, 3, dtype=torch.float32, device=device)
-    origins[:, 0] = -(row - (num_rows - 1) / 2) * spacing
-    origins[:, 1] = (index % num_cols - (num_cols - 1) / 2) * spacing
-    return origins
-
-
-def assign_columns(
-    num_envs: int, num_cols: int, proportions: np.ndarray | None, device: str
-) -> torch.Tensor:
-    """Return (num_envs,) terrain columns: each column gets a contiguous block of environments.
-
-    With one proportion for each column, blocks are sized by them: every column first gets one
-    environment (if there are enough), and the rest is split by largest remainder. Otherwise blocks
-    are of equal size.
-    """
-    if proportions is None or len(proportions) != num_cols:
-        index = torch.arange(num_envs, device=device)
-        return torch.div(index * num_cols, num_envs, rounding_mode="floor")
-    counts = torch.tensor(split_by_proportion(num_envs, np.asarray(proportions)), device=device)
-    return torch.repeat_interleave(torch.arange(num_cols, device=device), counts)
-
-
-def split_by_proportion(total: int, proportions: np.ndarray) -> list[int]:
-    """Return how many of `total` each share gets: at least one where possible; sums to `total`.
-
-    Raises:
-        ValueError: a proportion is negative, or all are zero.
-    """
-    proportions = np.asarray(proportions, dtype=np.float64)
-    if (proportions < 0.0).any() or proportions.sum() <= 0.0:
-        raise ValueError(
-            f"Terrain proportions {proportions.tolist()} must not be negative, and not all zero."
-        )
-    shares = proportions / proportions.sum()
-    counts = np.full(len(shares), 1 if total >= len(shares) else 0)
-    exact = shares * (total - counts.sum())
-    # Products such as 0.3 * 10 must not fall below the whole number that they mean.
-    whole = np.floor(exact + 1e-9).astype(int)
-    counts += whole
-    left_over = total - int(counts.sum())
-    if left_over > 0:
-        largest = np.argsort(exact - whole, kind="stable")[-left_over:]
-        counts[largest] += 1
-    return counts.tolist()
-
-
-# MERGED mjlab.terrains.terrain_entity: Sites that show where environments start, spawn points, and flat patches.
-
+# Debug sites.
 _SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
 _BOX = mujoco.mjtGeom.mjGEOM_BOX
 _GREEN = (0.2, 0.6, 0.2, 0.3)
@@ -87,49 +27,6 @@ _YELLOW = (0.6, 0.6, 0.2, 0.3)
 
 # Half the height of the box that shows a flat patch, in metres.
 _PATCH_HALF_HEIGHT = 0.02
-
-
-def add_debug_sites(
-    body: mujoco.MjsBody,
-    env_origins: torch.Tensor,
-    terrain_origins: torch.Tensor | None,
-    flat_patches: Mapping[str, torch.Tensor],
-    flat_patch_radii: Mapping[str, float],
-) -> None:
-    """Add sites that show the initial state.
-
-    Args:
-        body: The body of the terrain.
-        env_origins: (N, 3) origins of environments: `env_origin_<i>`, group 4.
-        terrain_origins: (R, C, 3) spawn points, if any: `terrain_origin_<r>_<c>`, group 5.
-        flat_patches: (R, C, number, 3) positions by name: `flat_patch_<name>_<r>_<c>_<k>`, group 3.
-        flat_patch_radii: Radius of the flat patches by name, in metres.
-    """
-    for index, place in enumerate(env_origins.tolist()):
-        body.add_site(
-            name=f"env_origin_{index}", type=_SPHERE, size=(0.3, 0.0, 0.0), pos=place, group=4,
-            rgba=_GREEN,
-        )  # fmt: skip
-    for row, places in enumerate([] if terrain_origins is None else terrain_origins.tolist()):
-        for col, place in enumerate(places):
-            body.add_site(
-                name=f"terrain_origin_{row}_{col}", type=_SPHERE, size=(0.5, 0.0, 0.0), pos=place,
-                group=5, rgba=_BLUE,
-            )  # fmt: skip
-    for name, patches in flat_patches.items():
-        radius = flat_patch_radii[name]
-        # MuJoCo refuses sites without extent, and a patch may be a single point.
-        size = (
-            max(radius, _PATCH_HALF_HEIGHT),
-            max(radius, _PATCH_HALF_HEIGHT),
-            _PATCH_HALF_HEIGHT,
-        )
-        for index in torch.cartesian_prod(*(torch.arange(n) for n in patches.shape[:3])).tolist():
-            row, col, k = index
-            body.add_site(
-                name=f"flat_patch_{name}_{row}_{col}_{k}", type=_BOX, size=size,
-                pos=patches[row, col, k].tolist(), group=3, rgba=_YELLOW,
-            )  # fmt: skip
 
 
 _SUN = spec_cfg.LightCfg(name="sun", type="directional", pos=(0.0, 0.0, 1.5))
@@ -180,17 +77,10 @@ class TerrainEntityCfg(EntityCfg):
 
     def build(self) -> NoReturn:
         """Not offered, because a terrain also needs a device: use `TerrainEntity(cfg, device)`."""
-        raise TypeError(
+        raise WrongTypeError(
             "TerrainEntityCfg.build() cannot know the device. Set SceneCfg.terrain, or call "
             "TerrainEntity(cfg, device)."
         )
-
-
-def _without_plane(cfg: TerrainEntityCfg) -> TerrainEntityCfg:
-    """Return a copy whose default material is not looked for on a plane, which is not there."""
-    added_only = dataclasses.replace(_GROUND_MATERIAL, geom_names_expr=None)
-    materials = tuple(added_only if m == _GROUND_MATERIAL else m for m in cfg.materials)
-    return dataclasses.replace(cfg, materials=materials)
 
 
 class TerrainEntity(Entity):
@@ -223,7 +113,12 @@ class TerrainEntity(Entity):
         self._holds_levels = False
         self._flat_patches: dict[str, torch.Tensor] = {}
         self._flat_patch_radii: dict[str, float] = {}
-        super().__init__(_without_plane(cfg) if cfg.terrain_type == "generator" else cfg)
+        if cfg.terrain_type == "generator":
+            # There is no plane that the default material could be given to.
+            added_only = dataclasses.replace(_GROUND_MATERIAL, geom_names_expr=None)
+            materials = tuple(added_only if m == _GROUND_MATERIAL else m for m in cfg.materials)
+            cfg = dataclasses.replace(cfg, materials=materials)
+        super().__init__(cfg)
 
     def _make_spec(self) -> mujoco.MjSpec:
         top = self.cfg.max_init_terrain_level
@@ -232,30 +127,17 @@ class TerrainEntity(Entity):
                 f"TerrainEntityCfg.max_init_terrain_level is {top}; it must be 0 or more, or None "
                 "for all levels."
             )
-        if self.cfg.terrain_type not in ("plane", "generator"):
-            raise ValueError(
-                f"TerrainEntityCfg.terrain_type is {self.cfg.terrain_type!r}; it must be 'plane' "
-                "or 'generator'."
-            )
+        check_one_of("TerrainEntityCfg.terrain_type", self.cfg.terrain_type, ("plane", "generator"))
         spec = mujoco.MjSpec()
         if self.cfg.terrain_type == "plane":
-            self._add_plane(spec)
+            body = spec.worldbody.add_body(name="terrain")
+            body.add_geom(name="terrain", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 0.01))
+            self.configure_env_origins()
         else:
             self._generate(spec)
         if self.cfg.debug_vis:
-            add_debug_sites(
-                spec.body("terrain"),
-                self.env_origins,
-                self.terrain_origins,
-                self._flat_patches,
-                self._flat_patch_radii,
-            )
+            self._add_debug_sites(spec.body("terrain"))
         return spec
-
-    def _add_plane(self, spec: mujoco.MjSpec) -> None:
-        body = spec.worldbody.add_body(name="terrain")
-        body.add_geom(name="terrain", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 0.01))
-        self.configure_env_origins()
 
     def _generate(self, spec: mujoco.MjSpec) -> None:
         """Add the configured grid of sub-terrains and put the environments on it."""
@@ -275,6 +157,34 @@ class TerrainEntity(Entity):
         # Elsewhere a column holds several kinds, even where there are as many columns as kinds.
         shares = generator.proportions if generator.cfg.curriculum else None
         self.configure_env_origins(generator.terrain_origins, shares)
+
+    def _add_debug_sites(self, body: mujoco.MjsBody) -> None:
+        """Add sites `env_origin_<i>` (group 4), `terrain_origin_<r>_<c>` (group 5), and
+        `flat_patch_<name>_<r>_<c>_<k>` (group 3)."""
+        for index, place in enumerate(self.env_origins.tolist()):
+            body.add_site(
+                name=f"env_origin_{index}", type=_SPHERE, size=(0.3, 0.0, 0.0), pos=place, group=4,
+                rgba=_GREEN,
+            )  # fmt: skip
+        origins = [] if self.terrain_origins is None else self.terrain_origins.tolist()
+        for row, places in enumerate(origins):
+            for col, place in enumerate(places):
+                body.add_site(
+                    name=f"terrain_origin_{row}_{col}", type=_SPHERE, size=(0.5, 0.0, 0.0), pos=place,
+                    group=5, rgba=_BLUE,
+                )  # fmt: skip
+        for name, patches in self._flat_patches.items():
+            # MuJoCo refuses sites without extent, and a patch may be a single point.
+            radius = max(self._flat_patch_radii[name], _PATCH_HALF_HEIGHT)
+            size = (radius, radius, _PATCH_HALF_HEIGHT)
+            for index in torch.cartesian_prod(
+                *(torch.arange(n) for n in patches.shape[:3])
+            ).tolist():
+                row, col, k = index
+                body.add_site(
+                    name=f"flat_patch_{name}_{row}_{col}_{k}", type=_BOX, size=size,
+                    pos=patches[row, col, k].tolist(), group=3, rgba=_YELLOW,
+                )  # fmt: skip
 
     def _placeable(self, spec: mujoco.MjSpec) -> mujoco.MjSpec:
         # The ground stays where it is.
@@ -383,3 +293,60 @@ class TerrainEntity(Entity):
         if grid is not None and kept is not None and types is not None:
             kept[env_ids] = levels
             self.env_origins[env_ids] = grid[levels, types[env_ids]]
+
+
+def grid_origins(num_envs: int, spacing: float, device: str) -> torch.Tensor:
+    """Return (num_envs, 3) origins on a square grid, centred on the world's origin.
+
+    With `rows = ceil(N / floor(sqrt N))` and `cols = ceil(N / rows)`, environment k is in row
+    `i = k div cols` and column `j = k mod cols`, at
+    `(-(i - (rows - 1) / 2) s, (j - (cols - 1) / 2) s, 0)`.
+    """
+    num_rows = math.ceil(num_envs / math.isqrt(num_envs))
+    num_cols = math.ceil(num_envs / num_rows)
+    index = torch.arange(num_envs, device=device)
+    row = torch.div(index, num_cols, rounding_mode="floor")
+    origins = torch.zeros(num_envs, 3, dtype=torch.float32, device=device)
+    origins[:, 0] = -(row - (num_rows - 1) / 2) * spacing
+    origins[:, 1] = (index % num_cols - (num_cols - 1) / 2) * spacing
+    return origins
+
+
+def assign_columns(
+    num_envs: int, num_cols: int, proportions: np.ndarray | None, device: str
+) -> torch.Tensor:
+    """Return (num_envs,) terrain columns: each column gets a contiguous block of environments.
+
+    With one proportion for each column, blocks are sized by them: every column first gets one
+    environment (if there are enough), and the rest is split by largest remainder. Otherwise blocks
+    are of equal size.
+    """
+    if proportions is None or len(proportions) != num_cols:
+        index = torch.arange(num_envs, device=device)
+        return torch.div(index * num_cols, num_envs, rounding_mode="floor")
+    counts = torch.tensor(split_by_proportion(num_envs, np.asarray(proportions)), device=device)
+    return torch.repeat_interleave(torch.arange(num_cols, device=device), counts)
+
+
+def split_by_proportion(total: int, proportions: np.ndarray) -> list[int]:
+    """Return how many of `total` each share gets: at least one where possible; sums to `total`.
+
+    Raises:
+        ValueError: a proportion is negative, or all are zero.
+    """
+    proportions = np.asarray(proportions, dtype=np.float64)
+    if (proportions < 0.0).any() or proportions.sum() <= 0.0:
+        raise ValueError(
+            f"Terrain proportions {proportions.tolist()} must not be negative, and not all zero."
+        )
+    shares = proportions / proportions.sum()
+    counts = np.full(len(shares), 1 if total >= len(shares) else 0)
+    exact = shares * (total - counts.sum())
+    # Products such as 0.3 * 10 must not fall below the whole number that they mean.
+    whole = np.floor(exact + 1e-9).astype(int)
+    counts += whole
+    left_over = total - int(counts.sum())
+    if left_over > 0:
+        largest = np.argsort(exact - whole, kind="stable")[-left_over:]
+        counts[largest] += 1
+    return counts.tolist()

@@ -1,203 +1,37 @@
-"""Helpers shared by sub-terrains and the generator."""
+"""Geometry and numbers that sub-terrains share: boxes, borders, flat patches, resampling."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
-if TYPE_CHECKING:
-    from mjlab.terrains.terrain_generator import FlatPatchSamplingCfg
-
-
-# MERGED mjlab.terrains.utils: Heights on a grid of another shape.
-
-
-def interpolate_cubic(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return whole (rows, cols) numbers of another shape, by a bicubic spline through those given.
-
-    Corners stay where they are. With fewer than four numbers along an axis, the spline is of a
-    lower degree there.
-    """
-    if values.shape == shape:
-        return values
-    # Loading it takes a second, and few terrains need it.
-    from scipy.interpolate import RectBivariateSpline
-
-    old_y, old_x = (np.linspace(0.0, 1.0, count) for count in values.shape)
-    degree_y, degree_x = (min(3, count - 1) for count in values.shape)
-    spline = RectBivariateSpline(old_y, old_x, values, kx=degree_y, ky=degree_x)
-    new_y, new_x = (np.linspace(0.0, 1.0, count) for count in shape)
-    return np.rint(spline(new_y, new_x)).astype(int)
-
-
-def resample_linear(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Resample (rows, cols) values linearly to another shape; corners stay where they are."""
-    for axis, count in enumerate(shape):
-        values = _resample_axis(values, count, axis)
-    return values
-
-
-def _resample_axis(values: np.ndarray, count: int, axis: int) -> np.ndarray:
-    old = values.shape[axis]
-    position = np.linspace(0.0, old - 1.0, count)
-    low = np.minimum(position.astype(int), max(old - 2, 0))
-    weight = np.expand_dims(position - low, 1 - axis)
-    lower = np.take(values, low, axis)
-    upper = np.take(values, np.minimum(low + 1, old - 1), axis)
-    return lower + weight * (upper - lower)
-
-
-# MERGED mjlab.terrains.utils: Where a height field is flat enough to put something down.
-
-
-def find_flat_patches_from_heightfield(
-    heights: np.ndarray,
-    horizontal_scale: float,
-    z_offset: float,
-    cfg: FlatPatchSamplingCfg,
-    rng: np.random.Generator,
-    size: tuple[float, float] | None = None,
-) -> np.ndarray:
-    """Draw flat patches of a height field, uniformly among all vertices that qualify.
-
-    With `r = ceil(patch_radius / spacing)`, a vertex qualifies if heights over the disc
-    `i^2 + j^2 <= r^2` of vertices around it differ by at most `max_height_diff`, if the disc is on
-    the field, and if its position lies in the ranges of the config. Radius 0 means the vertex
-    alone. Vertices are drawn without replacement while there are enough. If none qualifies, all
-    patches are the field's centre.
-
-    Args:
-        heights: (rows, cols) heights in metres, [row, col]: rows run along y.
-        horizontal_scale: Size of a pixel in metres.
-        z_offset: What to add to heights to get z of the world.
-        cfg: How many to find, and what counts as flat.
-        rng: Draws them.
-        size: Extent of the field along x and y, in metres; None for pixels times their number. The
-            vertices are `size / (n - 1)` apart, which is more than a pixel.
-
-    Returns:
-        (num_patches, 3) positions: x and y from the field's low corner, z of the world.
-    """
-    rows, cols = heights.shape
-    if size is None:
-        size = (cols * horizontal_scale, rows * horizontal_scale)
-    centre = (size[0] / 2, size[1] / 2, heights[rows // 2, cols // 2] + z_offset)
-    if cfg.grid_resolution is not None and cfg.grid_resolution < horizontal_scale:
-        finer = horizontal_scale / cfg.grid_resolution
-        heights = resample_linear(heights, (round(rows * finer), round(cols * finer)))
-    y, x = (
-        np.linspace(0.0, extent, count)
-        for extent, count in zip(size[::-1], heights.shape, strict=True)
-    )
-    flat = _flat_vertices(heights, _disc_radii(cfg.patch_radius, y, x), cfg.max_height_diff)
-    z = heights + z_offset
-    valid = (
-        flat & _within(y, cfg.y_range)[:, None] & _within(x, cfg.x_range) & _within(z, cfg.z_range)
-    )
-    row, col = np.nonzero(valid)
-    if len(row) == 0:
-        return np.tile(centre, (cfg.num_patches, 1))
-    drawn = rng.choice(len(row), size=cfg.num_patches, replace=len(row) < cfg.num_patches)
-    row, col = row[drawn], col[drawn]
-    return np.stack((x[col], y[row], z[row, col]), axis=-1)
-
-
-def check_flat_patch(name: str, cfg: FlatPatchSamplingCfg, size: tuple[float, float]) -> None:
-    """Raise `ValueError` if no field of the size could ever have the patch.
-
-    Args:
-        name: What the patch is called, for the message.
-        cfg: The patch.
-        size: Extent of the field along x and y, in metres.
-    """
-    where = f"flat_patch_sampling[{name!r}]"
-    if cfg.num_patches < 1:
-        raise ValueError(f"{where}: num_patches is {cfg.num_patches}; it must be at least 1.")
-    for field in ("patch_radius", "max_height_diff"):
-        if not getattr(cfg, field) >= 0.0:
-            raise ValueError(f"{where}: {field} is {getattr(cfg, field)}; it must not be negative.")
-    if cfg.grid_resolution is not None and not cfg.grid_resolution > 0.0:
-        raise ValueError(
-            f"{where}: grid_resolution is {cfg.grid_resolution}; it must be above 0, or None."
-        )
-    if 2.0 * cfg.patch_radius > min(size):
-        raise ValueError(
-            f"{where}: a disc with patch_radius {cfg.patch_radius:g} does not fit on a sub-terrain "
-            f"of {size[0]:g} x {size[1]:g} m. Use a radius of at most {min(size) / 2:g} m."
-        )
-    for field in ("x_range", "y_range", "z_range"):
-        low, high = getattr(cfg, field)
-        if not low <= high:
-            raise ValueError(
-                f"{where}: {field} is {(low, high)}; it must be (low, high) with low <= high."
-            )
-    for field, extent in (("x_range", size[0]), ("y_range", size[1])):
-        low, high = getattr(cfg, field)
-        first, last = cfg.patch_radius, extent - cfg.patch_radius
-        if high < first or low > last:
-            raise ValueError(
-                f"{where}: {field} is {(low, high)}, but centres of patches lie from {first:g} to "
-                f"{last:g} m. It is measured from the low corner of the sub-terrain."
-            )
-
-
-def _disc_radii(radius: float, y: np.ndarray, x: np.ndarray) -> tuple[int, int]:
-    """Return the radius of a patch in vertices along y and along x."""
-    along_y, along_x = (math.ceil(radius / (axis[1] - axis[0]) - 1e-9) for axis in (y, x))
-    return along_y, along_x
-
-
-def _within(values: np.ndarray, ends: tuple[float, float]) -> np.ndarray:
-    return (values >= ends[0]) & (values <= ends[1])
-
-
-def _flat_vertices(heights: np.ndarray, radii: tuple[int, int], limit: float) -> np.ndarray:
-    """Return (rows, cols) whether heights over the disc around each vertex differ by `limit`."""
-    flat = np.zeros(heights.shape, dtype=bool)
-    r, c = radii
-    rows, cols = heights.shape
-    if rows > 2 * r and cols > 2 * c:
-        spread = _disc_max(heights, radii) + _disc_max(-heights, radii)
-        # Differences of multiples of a vertical step carry rounding of the last bits.
-        flat[r : rows - r, c : cols - c] = spread <= limit + 1e-9
-    return flat
-
-
-def _disc_max(values: np.ndarray, radii: tuple[int, int]) -> np.ndarray:
-    """Return the largest value over the disc around each vertex whose disc is on the field.
-
-    A disc is a stack of rows, and the largest value of any run of columns is that of two runs of a
-    power-of-two length that cover it. So the work grows with the radius rather than its square.
-
-    Args:
-        values: (rows, cols).
-        radii: Half-axes (r, c) of the disc `(i / r)^2 + (j / c)^2 <= 1`, in vertices.
-
-    Returns:
-        (rows - 2 r, cols - 2 c).
-    """
-    r, c = radii
-    rows, cols = values.shape
-    runs = [values]
-    while 2 ** len(runs) <= 2 * c + 1:
-        shorter, step = runs[-1], 2 ** (len(runs) - 1)
-        runs.append(np.maximum(shorter[:, : shorter.shape[1] - step], shorter[:, step:]))
-    highest = np.full((rows - 2 * r, cols - 2 * c), -np.inf)
-    for i in range(-r, r + 1):
-        half = int(c * math.sqrt(1.0 - (i / r) ** 2) + 1e-9) if r else c
-        length = 2 * half + 1
-        power = length.bit_length() - 1
-        strip = runs[power][r + i : rows - r + i]
-        for start in (c - half, c + half + 1 - 2**power):
-            np.maximum(highest, strip[:, start : start + cols - 2 * c], out=highest)
-    return highest
-
+from mjlab.utils.errors import check_count, check_in_range, check_positive
 
 # MuJoCo refuses geoms without extent.
 _MIN_HALF_SIZE = 1e-6
+
+
+@dataclass
+class FlatPatchSamplingCfg:
+    """Describes which flat spots of a height field to look for."""
+
+    num_patches: int = 10
+    """Number of spots."""
+    patch_radius: float = 0.5
+    """Radius of a spot, in metres."""
+    max_height_diff: float = 0.05
+    """Largest difference in height within a spot, in metres."""
+    x_range: tuple[float, float] = (-1e6, 1e6)
+    """Where the middle of a spot may be along x, in metres from the corner of the sub-terrain."""
+    y_range: tuple[float, float] = (-1e6, 1e6)
+    """Where the middle of a spot may be along y, likewise."""
+    z_range: tuple[float, float] = (-1e6, 1e6)
+    """How high the middle of a spot may be in the world, in metres."""
+    grid_resolution: float | None = None
+    """Distance of the points that are tried, in metres, where finer than those of the field."""
 
 
 def make_plane(
@@ -262,3 +96,170 @@ def add_box(
     """Add a box to `body`, from its centre and its full extent along x, y and z, in metres."""
     half = [max(length / 2, _MIN_HALF_SIZE) for length in extent]
     return body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=center, size=half)
+
+
+def find_flat_patches_from_heightfield(
+    heights: np.ndarray,
+    horizontal_scale: float,
+    z_offset: float,
+    cfg: FlatPatchSamplingCfg,
+    rng: np.random.Generator,
+    size: tuple[float, float] | None = None,
+) -> np.ndarray:
+    """Draw flat patches of a height field, uniformly among all vertices that qualify.
+
+    With `r = ceil(patch_radius / spacing)`, a vertex qualifies if heights over the disc
+    `i^2 + j^2 <= r^2` of vertices around it differ by at most `max_height_diff`, if the disc is on
+    the field, and if its position lies in the ranges of the config. Radius 0 means the vertex
+    alone. Vertices are drawn without replacement while there are enough. If none qualifies, all
+    patches are the field's centre.
+
+    Args:
+        heights: (rows, cols) heights in metres, [row, col]: rows run along y.
+        horizontal_scale: Size of a pixel in metres.
+        z_offset: What to add to heights to get z of the world.
+        cfg: How many to find, and what counts as flat.
+        rng: Draws them.
+        size: Extent of the field along x and y, in metres; None for pixels times their number. The
+            vertices are `size / (n - 1)` apart, which is more than a pixel.
+
+    Returns:
+        (num_patches, 3) positions: x and y from the field's low corner, z of the world.
+    """
+    rows, cols = heights.shape
+    if size is None:
+        size = (cols * horizontal_scale, rows * horizontal_scale)
+    centre = (size[0] / 2, size[1] / 2, heights[rows // 2, cols // 2] + z_offset)
+    if cfg.grid_resolution is not None and cfg.grid_resolution < horizontal_scale:
+        finer = horizontal_scale / cfg.grid_resolution
+        heights = resample_linear(heights, (round(rows * finer), round(cols * finer)))
+    y, x = (
+        np.linspace(0.0, extent, count)
+        for extent, count in zip(size[::-1], heights.shape, strict=True)
+    )
+    # Radius of a patch in vertices along y and along x.
+    row_radius, col_radius = (
+        math.ceil(cfg.patch_radius / (axis[1] - axis[0]) - 1e-9) for axis in (y, x)
+    )
+    flat = _flat_vertices(heights, (row_radius, col_radius), cfg.max_height_diff)
+    z = heights + z_offset
+    valid = (
+        flat & _within(y, cfg.y_range)[:, None] & _within(x, cfg.x_range) & _within(z, cfg.z_range)
+    )
+    row, col = np.nonzero(valid)
+    if len(row) == 0:
+        return np.tile(centre, (cfg.num_patches, 1))
+    drawn = rng.choice(len(row), size=cfg.num_patches, replace=len(row) < cfg.num_patches)
+    row, col = row[drawn], col[drawn]
+    return np.stack((x[col], y[row], z[row, col]), axis=-1)
+
+
+def check_flat_patch(name: str, cfg: FlatPatchSamplingCfg, size: tuple[float, float]) -> None:
+    """Raise `ValueError` if no field of the size could ever have the patch.
+
+    Args:
+        name: What the patch is called, for the message.
+        cfg: The patch.
+        size: Extent of the field along x and y, in metres.
+    """
+    where = f"flat_patch_sampling[{name!r}]"
+    check_count(f"{where} num_patches", cfg.num_patches)
+    check_in_range(f"{where} patch_radius", cfg.patch_radius, 0.0, min(size) / 2)
+    check_in_range(f"{where} max_height_diff", cfg.max_height_diff, 0.0, math.inf)
+    if cfg.grid_resolution is not None:
+        check_positive(f"{where} grid_resolution", cfg.grid_resolution)
+    for field, extent in (("x_range", size[0]), ("y_range", size[1]), ("z_range", math.inf)):
+        low, high = getattr(cfg, field)
+        if not low <= high:
+            raise ValueError(
+                f"{where} {field}: expected (low, high) with low <= high, got {low, high}."
+            )
+        first, last = cfg.patch_radius, extent - cfg.patch_radius
+        if field != "z_range" and (high < first or low > last):
+            raise ValueError(
+                f"{where} {field}: expected a range that meets [{first:g}, {last:g}], the centres of "
+                f"patches that fit, got {low, high}. It is measured from the low corner of the "
+                "sub-terrain."
+            )
+
+
+def interpolate_cubic(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Return whole (rows, cols) numbers of another shape, by a bicubic spline through those given.
+
+    Corners stay where they are. With fewer than four numbers along an axis, the spline is of a
+    lower degree there.
+    """
+    if values.shape == shape:
+        return values
+    # Loading it takes a second, and few terrains need it.
+    from scipy.interpolate import RectBivariateSpline
+
+    old_y, old_x = (np.linspace(0.0, 1.0, count) for count in values.shape)
+    degree_y, degree_x = (min(3, count - 1) for count in values.shape)
+    spline = RectBivariateSpline(old_y, old_x, values, kx=degree_y, ky=degree_x)
+    new_y, new_x = (np.linspace(0.0, 1.0, count) for count in shape)
+    return np.rint(spline(new_y, new_x)).astype(int)
+
+
+def resample_linear(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Resample (rows, cols) values linearly to another shape; corners stay where they are."""
+    for axis, count in enumerate(shape):
+        old = values.shape[axis]
+        position = np.linspace(0.0, old - 1.0, count)
+        low = np.minimum(position.astype(int), max(old - 2, 0))
+        weight = np.expand_dims(position - low, 1 - axis)
+        lower = np.take(values, low, axis)
+        upper = np.take(values, np.minimum(low + 1, old - 1), axis)
+        values = lower + weight * (upper - lower)
+    return values
+
+
+def lerp(ends: tuple[float, float], difficulty: float) -> float:
+    """Return the value of a range at a difficulty: its low end at 0, its high end at 1."""
+    return ends[0] + difficulty * (ends[1] - ends[0])
+
+
+def _flat_vertices(heights: np.ndarray, radii: tuple[int, int], limit: float) -> np.ndarray:
+    """Return (rows, cols) whether heights over the disc around each vertex differ by `limit`."""
+    flat = np.zeros(heights.shape, dtype=bool)
+    r, c = radii
+    rows, cols = heights.shape
+    if rows > 2 * r and cols > 2 * c:
+        spread = _disc_max(heights, radii) + _disc_max(-heights, radii)
+        # Differences of multiples of a vertical step carry rounding of the last bits.
+        flat[r : rows - r, c : cols - c] = spread <= limit + 1e-9
+    return flat
+
+
+def _disc_max(values: np.ndarray, radii: tuple[int, int]) -> np.ndarray:
+    """Return the largest value over the disc around each vertex whose disc is on the field.
+
+    A disc is a stack of rows, and the largest value of any run of columns is that of two runs of a
+    power-of-two length that cover it. So the work grows with the radius rather than its square.
+
+    Args:
+        values: (rows, cols).
+        radii: Half-axes (r, c) of the disc `(i / r)^2 + (j / c)^2 <= 1`, in vertices.
+
+    Returns:
+        (rows - 2 r, cols - 2 c).
+    """
+    r, c = radii
+    rows, cols = values.shape
+    runs = [values]
+    while 2 ** len(runs) <= 2 * c + 1:
+        shorter, step = runs[-1], 2 ** (len(runs) - 1)
+        runs.append(np.maximum(shorter[:, : shorter.shape[1] - step], shorter[:, step:]))
+    highest = np.full((rows - 2 * r, cols - 2 * c), -np.inf)
+    for i in range(-r, r + 1):
+        half = int(c * math.sqrt(1.0 - (i / r) ** 2) + 1e-9) if r else c
+        length = 2 * half + 1
+        power = length.bit_length() - 1
+        strip = runs[power][r + i : rows - r + i]
+        for start in (c - half, c + half + 1 - 2**power):
+            np.maximum(highest, strip[:, start : start + cols - 2 * c], out=highest)
+    return highest
+
+
+def _within(values: np.ndarray, ends: tuple[float, float]) -> np.ndarray:
+    return (values >= ends[0]) & (values <= ends[1])

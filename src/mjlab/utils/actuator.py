@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from mjlab.utils.errors import check_positive
+
 
 @dataclass
 class ElectricActuator:
@@ -76,10 +78,7 @@ def reflect_rotary_to_linear(
 
     Returns mass I / r^2, speed r omega and force tau / r. Raises `ValueError` unless r > 0.
     """
-    if transmission_ratio <= 0:
-        raise ValueError(
-            f"The transmission ratio is {transmission_ratio} m/rad; it must be positive."
-        )
+    check_positive("transmission_ratio (m/rad)", transmission_ratio)
     return LinearJointProperties(
         armature=armature_rotary / transmission_ratio**2,
         velocity_limit=velocity_limit_rotary * transmission_ratio,

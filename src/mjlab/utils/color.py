@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjlab.utils.errors import check_in_range
+
 
 class RGB(NamedTuple):
     """Red, green and blue."""
@@ -102,8 +104,7 @@ def brand_ramp(
     The hue stays; value = 0.75 + 0.25 t, saturation = s (0.85 + 0.25 t), at most 1. Raises
     `ValueError` for t outside [0, 1].
     """
-    if not 0.0 <= t <= 1.0:
-        raise ValueError(f"t is {t}; it must be from 0 to 1.")
+    check_in_range("t", t, 0.0, 1.0)
     hue, saturation, _ = rgb_to_hsv(base_rgb)
     shade = HSV(hue, clamp(saturation * (0.85 + 0.25 * t)), 0.75 + 0.25 * t)
     return (*hsv_to_rgb(shade), alpha)

@@ -2,6 +2,7 @@
 
     MjlabError                 base; commands print the message without a traceback
     ├── UserError              in what a command was asked to do
+    │   └── BadCallError       in the command line itself; nothing was started
     ├── UnknownNameError       no such entity, sensor, term, ...   (a KeyError)
     ├── UnknownAttributeError  no such attribute                   (an AttributeError)
     ├── WrongTypeError         value or class of the wrong type    (a TypeError)
@@ -14,6 +15,7 @@ Messages read "<owner> <field>: expected X, got Y; use Z."
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from numbers import Integral
 from typing import Any
@@ -24,12 +26,18 @@ from mjlab.utils.string import suggest
 class MjlabError(Exception):
     """Base of errors that a user can fix."""
 
+    exit_status = 1
+    """Exit status of a command that ends with this error."""
+
 
 class UserError(MjlabError):
     """Error in what a command was asked to do."""
 
-    exit_status = 1
-    """Exit status of the command."""
+
+class BadCallError(UserError):
+    """Error in the command line itself, found before anything is built."""
+
+    exit_status = 2
 
 
 class UnknownNameError(MjlabError, KeyError):
@@ -79,6 +87,28 @@ def check_one_of(name: str, value: Any, allowed: Iterable[Any]) -> None:
     options = list(allowed)
     if value not in options:
         raise ValueError(f"{name}: expected one of {options}, got {value!r}.")
+
+
+def check_field(cfg: Any, field: str, holds: bool, expected: str) -> None:
+    """Raise `ValueError` "<class>.<field>: expected <expected>, got <value>." unless `holds`."""
+    if not holds:
+        raise ValueError(
+            f"{type(cfg).__name__}.{field}: expected {expected}, got {getattr(cfg, field)!r}."
+        )
+
+
+def check_fields_positive(cfg: Any, *fields: str) -> None:
+    """Raise `ValueError` for the first of the fields that is not a finite number > 0."""
+    for field in fields:
+        check_field(cfg, field, 0.0 < getattr(cfg, field) < math.inf, "a finite number > 0")
+
+
+def check_field_range(cfg: Any, field: str, lowest: float = -math.inf) -> None:
+    """Raise `ValueError` unless the field is (low, high) with `lowest` <= low <= high, finite."""
+    low, high = getattr(cfg, field)
+    holds = math.isfinite(low) and math.isfinite(high) and lowest <= low <= high
+    bound = "" if lowest == -math.inf else f"{lowest:g} <= "
+    check_field(cfg, field, holds, f"finite (low, high) with {bound}low <= high")
 
 
 def check_exists(

@@ -36,7 +36,10 @@ def choose_graphics_library() -> None:
     if value not in known:
         options = ", ".join(("glfw", *_OF_PLATFORM.get(sys.platform, ()), _OFF))
         problem = f"{_VARIABLE}={given} is unknown to MuJoCo; unset it, or choose from {options}"
-    elif (value == "egl" and not _has_egl()) or (value == "osmesa" and not _has_osmesa()):
+    elif (value == "egl" and not _has_egl()) or (
+        # As PyOpenGL looks for it.
+        value == "osmesa" and ctypes.util.find_library("OSMesa") is None
+    ):
         problem = f"{_VARIABLE}={given}, and that library is not installed"
     else:
         return
@@ -49,8 +52,3 @@ def _has_egl() -> bool:
     except OSError:
         return False
     return True
-
-
-def _has_osmesa() -> bool:
-    # As PyOpenGL looks for it.
-    return ctypes.util.find_library("OSMesa") is not None

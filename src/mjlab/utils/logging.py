@@ -14,6 +14,8 @@ _CODES = {
     "white": 37,
 }
 
+_LONGEST = 8000
+
 
 def print_info(message: str, color: str = "green") -> None:
     """Print a message, coloured where the output is a terminal. For command lines, not libraries.
@@ -25,3 +27,14 @@ def print_info(message: str, color: str = "green") -> None:
     if sys.stdout.isatty():
         message = f"\033[{_CODES[color]}m{message}\033[0m"
     print(message)
+
+
+def print_notice(message: str) -> None:
+    """Print a notice to standard error; standard output is for a command's results."""
+    print(shorten(message), file=sys.stderr, flush=True)
+
+
+def shorten(text: str) -> str:
+    """Return `text`; of more than 8,000 characters, of a damaged file say, only both ends."""
+    half = _LONGEST // 2
+    return text if len(text) <= _LONGEST else f"{text[:half]} [...] {text[-half:]}"

@@ -10,6 +10,8 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
+from mjlab.utils.errors import check_one_of
+
 CommandField = Literal["position", "velocity", "effort"]
 
 _FREE, _BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
@@ -21,6 +23,21 @@ _WIDTHS = {
     int(_BALL): (4, 3),
     int(_SLIDE): (1, 1),
     int(_HINGE): (1, 1),
+}
+
+# In the order of controls. A feedforward is a force; a voltage is commanded as an effort.
+_INPUTS: tuple[tuple[mujoco.mjtCtrlInput, CommandField], ...] = (
+    (mujoco.mjtCtrlInput.mjINPUT_POS, "position"),
+    (mujoco.mjtCtrlInput.mjINPUT_VEL, "velocity"),
+    (mujoco.mjtCtrlInput.mjINPUT_FF, "effort"),
+    (mujoco.mjtCtrlInput.mjINPUT_VOLTAGE, "effort"),
+)
+# Inputs where the spec states none.
+_DEFAULT_INPUTS = {
+    int(mujoco.mjtGain.mjGAIN_PID): (
+        mujoco.mjtCtrlInput.mjINPUT_POS.value | mujoco.mjtCtrlInput.mjINPUT_VEL.value
+    ),
+    int(mujoco.mjtGain.mjGAIN_DCMOTOR): mujoco.mjtCtrlInput.mjINPUT_VOLTAGE.value,
 }
 
 OPTION_ENUMS = {
@@ -41,10 +58,7 @@ def enum_value(option: str, name: Any, enum: Any, prefix: str = "") -> int:
         ValueError: an unknown name, with the valid ones. `option` says where it was given.
     """
     members = _members(enum, prefix)
-    if name not in members:
-        raise ValueError(
-            f"{option}: {name!r} is not known to MuJoCo. Choose from: {', '.join(members)}."
-        )
+    check_one_of(option, name, members)
     return members[name]
 
 
@@ -60,14 +74,6 @@ def flag_names(option: str, bits: int) -> list[str]:
     return [name for name, bit in _members(*OPTION_ENUMS[option]).items() if bits & bit]
 
 
-def _members(enum: Any, prefix: str) -> dict[str, int]:
-    return {
-        name.removeprefix(prefix).lower(): int(value)
-        for name, value in enum.__members__.items()
-        if name.startswith(prefix)
-    }
-
-
 def qpos_width(joint_type: int | mujoco.mjtJoint) -> int:
     """Return how many entries of `qpos` a joint of this type has. `ValueError` if unknown."""
     return _width(joint_type)[0]
@@ -76,16 +82,6 @@ def qpos_width(joint_type: int | mujoco.mjtJoint) -> int:
 def dof_width(joint_type: int | mujoco.mjtJoint) -> int:
     """Return how many entries of `qvel` a joint of this type has. `ValueError` if unknown."""
     return _width(joint_type)[1]
-
-
-def _width(joint_type: int | mujoco.mjtJoint) -> tuple[int, int]:
-    try:
-        return _WIDTHS[int(joint_type)]
-    except KeyError:
-        raise ValueError(
-            f"{joint_type!r} is no joint type; use a member of mujoco.mjtJoint "
-            "(mjJNT_FREE, mjJNT_BALL, mjJNT_SLIDE or mjJNT_HINGE)."
-        ) from None
 
 
 def is_muscle_actuator(actuator: mujoco.MjsActuator) -> bool:
@@ -119,22 +115,6 @@ def is_motor_actuator(actuator: mujoco.MjsActuator) -> bool:
         and actuator.biastype == mujoco.mjtBias.mjBIAS_NONE
         and not is_muscle_actuator(actuator)
     )
-
-
-# In the order of controls. A feedforward is a force; a voltage is commanded as an effort.
-_INPUTS: tuple[tuple[mujoco.mjtCtrlInput, CommandField], ...] = (
-    (mujoco.mjtCtrlInput.mjINPUT_POS, "position"),
-    (mujoco.mjtCtrlInput.mjINPUT_VEL, "velocity"),
-    (mujoco.mjtCtrlInput.mjINPUT_FF, "effort"),
-    (mujoco.mjtCtrlInput.mjINPUT_VOLTAGE, "effort"),
-)
-# Inputs where the spec states none.
-_DEFAULT_INPUTS = {
-    int(mujoco.mjtGain.mjGAIN_PID): (
-        mujoco.mjtCtrlInput.mjINPUT_POS.value | mujoco.mjtCtrlInput.mjINPUT_VEL.value
-    ),
-    int(mujoco.mjtGain.mjGAIN_DCMOTOR): mujoco.mjtCtrlInput.mjINPUT_VOLTAGE.value,
-}
 
 
 def control_inputs(actuator: mujoco.MjsActuator) -> tuple[CommandField | None, ...]:
@@ -201,6 +181,24 @@ def force_columns(model: mujoco.MjModel, actuator_ids: Iterable[int]) -> list[in
     """Return the columns of `actuator_force` of each actuator in turn, one or several."""
     starts, widths = model.actuator_outadr, model.actuator_outnum
     return [int(starts[i]) + k for i in actuator_ids for k in range(widths[i])]
+
+
+def _members(enum: Any, prefix: str) -> dict[str, int]:
+    return {
+        name.removeprefix(prefix).lower(): int(value)
+        for name, value in enum.__members__.items()
+        if name.startswith(prefix)
+    }
+
+
+def _width(joint_type: int | mujoco.mjtJoint) -> tuple[int, int]:
+    try:
+        return _WIDTHS[int(joint_type)]
+    except KeyError:
+        raise ValueError(
+            f"{joint_type!r} is no joint type; use a member of mujoco.mjtJoint "
+            "(mjJNT_FREE, mjJNT_BALL, mjJNT_SLIDE or mjJNT_HINGE)."
+        ) from None
 
 
 def _has_affine_bias(actuator: mujoco.MjsActuator) -> bool:

@@ -15,6 +15,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mjlab.utils.errors import check_count
 from mjlab.utils.os import own_folder, replacing
 
 if TYPE_CHECKING:
@@ -87,10 +88,7 @@ class NanGuard:
             ValueError: a buffer size or a number of environments to dump below 1.
         """
         for name in ("buffer_size", "max_envs_to_dump"):
-            if getattr(cfg, name) < 1:
-                raise ValueError(
-                    f"NanGuardCfg.{name} is {getattr(cfg, name)}; it has to be at least 1."
-                )
+            check_count(f"NanGuardCfg.{name}", getattr(cfg, name))
         self.cfg = cfg
         self.enabled = cfg.enabled
         self.num_envs = num_envs
@@ -327,8 +325,15 @@ class NanDump:
             if values is not None:
                 getattr(mj_data, name)[:] = values[row]
         for name, values in self.arrays.items():
-            if name.startswith("model_"):
-                _write_model_field(mj_model, name.removeprefix("model_"), values[row])
+            field = name.removeprefix("model_")
+            if field == name:
+                continue
+            owner: Any = mj_model if hasattr(mj_model, field) else mj_model.opt
+            present = getattr(owner, field)
+            if getattr(present, "shape", ()):
+                present[:] = values[row].reshape(present.shape)
+            else:
+                setattr(owner, field, values[row].item())
 
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray[Any, Any]]:
@@ -349,15 +354,6 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray[Any, Any]]:
             if not isinstance(arrays[name], np.ndarray):
                 raise ValueError(f"{name} is not an array")
     return arrays
-
-
-def _write_model_field(mj_model: mujoco.MjModel, name: str, value: Any) -> None:
-    owner: Any = mj_model if hasattr(mj_model, name) else mj_model.opt
-    present = getattr(owner, name)
-    if getattr(present, "shape", ()):
-        present[:] = value.reshape(present.shape)
-    else:
-        setattr(owner, name, value.item())
 
 
 def _link(link: Path, target: Path) -> None:

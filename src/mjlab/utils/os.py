@@ -70,8 +70,12 @@ def to_plain(value: Any, _parents: tuple[int, ...] = ()) -> Any:
     """Return `value` as dicts, lists, strings, numbers, booleans and None."""
     if isinstance(value, enum.Enum):
         return value.name
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return _plain_scalar(value)
+    if value is None:
+        return None
+    for kind in (bool, int, float, str):
+        # Subclasses (numpy's float64 among them) are unknown to the safe dumper.
+        if isinstance(value, kind):
+            return kind(value)
     if id(value) in _parents:
         return "<contains itself>"
     inner = (*_parents, id(value))
@@ -79,7 +83,12 @@ def to_plain(value: Any, _parents: tuple[int, ...] = ()) -> Any:
         # Fields are read one by one: `asdict` copies, which not every value allows.
         return {f.name: to_plain(getattr(value, f.name), inner) for f in dataclasses.fields(value)}
     if isinstance(value, Mapping):
-        return {_plain_key(key): to_plain(item, inner) for key, item in value.items()}
+        items = {}
+        for key, item in value.items():
+            plain_key = to_plain(key)
+            is_scalar = not isinstance(plain_key, (list, dict))
+            items[plain_key if is_scalar else str(key)] = to_plain(item, inner)
+        return items
     if isinstance(value, (set, frozenset)):
         return sorted((to_plain(item, inner) for item in value), key=str)
     if isinstance(value, (list, tuple)):
@@ -91,19 +100,6 @@ def to_plain(value: Any, _parents: tuple[int, ...] = ()) -> Any:
             "keywords": to_plain(value.keywords, inner),
         }
     return _plain_object(value)
-
-
-def _plain_scalar(value: Any) -> Any:
-    # Subclasses (numpy's float64 among them) are unknown to the safe dumper.
-    for kind in (bool, int, float, str):
-        if isinstance(value, kind):
-            return kind(value)
-    return None
-
-
-def _plain_key(key: Any) -> Any:
-    plain = to_plain(key)
-    return plain if isinstance(plain, (bool, int, float, str, type(None))) else str(key)
 
 
 def _plain_object(value: Any) -> Any:

@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from mjlab.utils.errors import check_in_range
+
 _MAX_SEED = 2**32 - 1
 _PROCESS_STRIDE = 2**20
 _EVALUATIONS, _SESSIONS = 2**31, 2**31 + 2**30
@@ -41,8 +43,7 @@ def seed_rng(seed: int, torch_deterministic: bool = False) -> None:
 
     Raises `ValueError` if the seed is out of range.
     """
-    if not 0 <= seed <= _MAX_SEED:
-        raise ValueError(f"The seed is {seed}; it must be from 0 to {_MAX_SEED}.")
+    check_in_range("seed", seed, 0, _MAX_SEED)
     os.environ["PYTHONHASHSEED"] = str(seed)
     random.seed(seed)
     np.random.seed(seed)

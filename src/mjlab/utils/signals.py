@@ -1,4 +1,4 @@
-"""TODO."""
+"""Signal handlers that are restored when their block ends: stop requests and the first Ctrl+C."""
 
 from __future__ import annotations
 
@@ -9,37 +9,12 @@ from collections.abc import Callable, Generator
 from types import FrameType
 from typing import Any
 
-# MERGED mjlab.utils.signals: Ending a loop by Ctrl+C without losing what comes after it.
-
-
-@contextlib.contextmanager
-def first_interrupt_calls(callback: Callable[[], None], enabled: bool) -> Generator[None]:
-    """Let the first Ctrl+C call `callback`, and a second one interrupt as usual."""
-    if not enabled or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    previous = signal.getsignal(signal.SIGINT)
-
-    def handler(signum: int, frame: Any) -> None:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        callback()
-
-    signal.signal(signal.SIGINT, handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, previous)
-
-
-# MERGED mjlab.utils.signals: SIGINT (Ctrl-C), SIGTERM and SIGHUP ask training to stop after the running iteration.
-
-
 # Not on every system: SIGHUP, which a closed terminal sends.
 _HANGUP = getattr(signal, "SIGHUP", None)
 
 
 class StopRequest:
-    """A context in which these signals set `signal_name` instead of ending the process.
+    """A context in which SIGINT, SIGTERM and SIGHUP set `signal_name` instead of ending the process.
 
     The handlers that were there before come back with the first signal, so that a second one does
     what it always did, and at the end of the context. A second SIGHUP is ignored until then, because
@@ -83,3 +58,22 @@ class StopRequest:
             handler = self._previous.pop(number)
             # A handler that was not set from Python reads as None and cannot be set again.
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+
+
+@contextlib.contextmanager
+def first_interrupt_calls(callback: Callable[[], None], enabled: bool) -> Generator[None]:
+    """Let the first Ctrl+C call `callback`, and a second one interrupt as usual."""
+    if not enabled or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous = signal.getsignal(signal.SIGINT)
+
+    def handler(signum: int, frame: Any) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        callback()
+
+    signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)

@@ -7,6 +7,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+from mjlab.utils.errors import check_count
+
 
 @dataclass
 class Space:
@@ -42,8 +44,7 @@ def batch_space(space: Space, batch_size: int) -> Space:
     Arrays get one more leading axis. A `Dict` batches each of its spaces and has the shape
     (batch_size,). Raises `ValueError` for a batch size less than 1.
     """
-    if batch_size < 1:
-        raise ValueError(f"The batch size is {batch_size}; it must be at least 1.")
+    check_count("batch_size", batch_size)
     if isinstance(space, Dict):
         spaces = {name: batch_space(inner, batch_size) for name, inner in space.spaces.items()}
         return dataclasses.replace(space, shape=(batch_size,), spaces=spaces)

@@ -8,16 +8,43 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import mujoco
 
 from mjlab.compat import accepts_older_fields, older_defaults, set_array_field
+from mjlab.utils.errors import check_exists, check_one_of
+from mjlab.utils.mujoco import enum_value
 from mjlab.utils.string import filter_exp, resolve_field
 
-# MERGED mjlab.utils.spec_config: What all spec editors share: their interface, and values given per name pattern.
+__all__ = [
+    "CameraCfg",
+    "CollisionCfg",
+    "GeomCfg",
+    "LightCfg",
+    "MaterialCfg",
+    "MeshCfg",
+    "SpecCfg",
+    "TextureCfg",
+    "warn_overlapping_geom_edits",
+]
+_REQUIRED = ("contype", "conaffinity", "condim", "priority")
+_ARRAYS = {"friction": 3, "solref": 2, "solimp": 5}
+_PATCHES = (*_ARRAYS, "margin", "gap", "solmix")
+_MAX_LISTED = 8
+_CUBE_FACES = 6
+_LIGHT_FIELDS = (
+    *("name", "castshadow", "pos", "dir", "cutoff", "exponent", "diffuse"),
+    *("specular", "ambient", "active", "attenuation"),
+)
+# MuJoCo's enum and the prefix of its members.
+_TEXTURE = (mujoco.mjtTexture, "mjTEXTURE_")
+_BUILTIN = (mujoco.mjtBuiltin, "mjBUILTIN_")
+_MARK = (mujoco.mjtMark, "mjMARK_")
+_LIGHT = (mujoco.mjtLightType, "mjLIGHT_")
+_CAM_LIGHT = (mujoco.mjtCamLight, "mjCAMLIGHT_")
 
 
 @dataclass(kw_only=True)
@@ -33,64 +60,156 @@ class SpecCfg(ABC):
         return
 
 
-def check_values(owner: SpecCfg, field: str, is_valid: Callable[[Any], bool], allowed: str) -> None:
-    """Raise `ValueError` unless each value of a field (scalar, or dict by pattern) is valid."""
-    for pattern, value in _values_by_pattern(getattr(owner, field)):
-        if value is not None and not is_valid(value):
-            where = "" if pattern is None else f" for pattern {pattern!r}"
-            raise ValueError(
-                f"{type(owner).__name__}.{field} is {value!r}{where}; it must be {allowed}."
-            )
+@accepts_older_fields
+@dataclass
+class CollisionCfg(SpecCfg):
+    """The collision setup of an entity. Values are given as in `GeomCfg`.
+
+    The four required attributes are always written, so dicts should cover every geom chosen; what
+    no pattern names gets contype 1, conaffinity 1, condim 3 or priority 0, with a warning. The
+    others are patches.
+    """
+
+    geom_names_expr: tuple[str, ...]
+    """Patterns that choose the geoms, matched at the start of the name."""
+    contype: int | dict[str, int]
+    """Collision type bits."""
+    conaffinity: int | dict[str, int]
+    """Bits of the collision types these geoms collide with."""
+    condim: int | dict[str, int]
+    """Contact dimension: 1, 3, 4 or 6."""
+    priority: int | dict[str, int]
+    """The geom with the higher priority decides friction and solver parameters of a contact."""
+    friction: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
+    """Sliding, torsional and rolling friction; fewer values set the first ones."""
+    solref: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
+    """Contact solver reference; fewer values set the first ones."""
+    solimp: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
+    """Contact solver impedance; fewer values set the first ones."""
+    margin: float | dict[str, float] | None = None
+    """Distance (m) below which a contact is found."""
+    gap: float | dict[str, float] | None = None
+    """Distance (m) by which a contact found is inactive."""
+    solmix: float | dict[str, float] | None = None
+    """Weight, 0 to 1, for averaging the contact parameters of two geoms."""
+    disable_other_geoms: bool = True
+    """Switch off collisions of every geom that no pattern matches."""
+    set_array_field = staticmethod(set_array_field)
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        """Write the setup. Raises `ValueError` if a value is not valid."""
+        self.validate()
+        geoms, others = _split_geoms(spec, self.geom_names_expr)
+        names = tuple(geom.name for geom in geoms)
+        required = {field: resolve_field(getattr(self, field), names) for field in _REQUIRED}
+        missing = {
+            field: [name for name, value in zip(names, values, strict=True) if value is None]
+            for field, values in required.items()
+        }
+        defaults = older_defaults(CollisionCfg, missing)
+        for field, values in required.items():
+            for geom, value in zip(geoms, values, strict=True):
+                setattr(geom, field, defaults[field] if value is None else value)
+        for field in _PATCHES:
+            _patch(geoms, field, getattr(self, field))
+        if self.disable_other_geoms:
+            for geom in others:
+                geom.contype = geom.conaffinity = 0
+
+    def validate(self) -> None:
+        """Raise `ValueError`, naming the field, the pattern and what is allowed."""
+        for field in _REQUIRED:
+            if getattr(self, field) is None:
+                raise ValueError(f"CollisionCfg.{field} is None; it must have a value.")
+        _validate_collision(self)
 
 
-def _values_by_pattern(value: Any) -> Iterator[tuple[str | None, Any]]:
-    if isinstance(value, dict):
-        yield from value.items()
-    else:
-        yield None, value
+@dataclass
+class GeomCfg(SpecCfg):
+    """A patch of geoms: what is None, or has no pattern that matches, stays as it is.
+
+    Every attribute is one value for all, or a dict of name pattern (matched at the start of the
+    name, the first in dict order counts) to value.
+    """
+
+    geom_names_expr: tuple[str, ...]
+    """Patterns that choose the geoms, matched at the start of the name."""
+    group: int | dict[str, int] | None = None
+    """Visualization group, 0 to 5."""
+    contype: int | dict[str, int] | None = None
+    """Collision type bits."""
+    conaffinity: int | dict[str, int] | None = None
+    """Bits of the collision types this geom collides with."""
+    condim: int | dict[str, int] | None = None
+    """Contact dimension: 1, 3, 4 or 6."""
+    priority: int | dict[str, int] | None = None
+    """The geom with the higher priority decides friction and solver parameters of a contact."""
+    friction: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
+    """Sliding, torsional and rolling friction; fewer values set the first ones."""
+    solref: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
+    """Contact solver reference; fewer values set the first ones."""
+    solimp: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
+    """Contact solver impedance; fewer values set the first ones."""
+    margin: float | dict[str, float] | None = None
+    """Distance (m) below which a contact is found."""
+    gap: float | dict[str, float] | None = None
+    """Distance (m) by which a contact found is inactive."""
+    solmix: float | dict[str, float] | None = None
+    """Weight, 0 to 1, for averaging the contact parameters of two geoms."""
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        """Patch the geoms. Raises `ValueError` if a value is not valid."""
+        self.validate()
+        geoms, _ = _split_geoms(spec, self.geom_names_expr)
+        for field in ("group", *_REQUIRED, *_PATCHES):
+            _patch(geoms, field, getattr(self, field))
+
+    def validate(self) -> None:
+        """Raise `ValueError`, naming the field, the pattern and what is allowed."""
+        check_values(self, "group", lambda value: value in range(6), "from 0 to 5")
+        _validate_collision(self)
 
 
-def mujoco_enum(owner: SpecCfg, field: str, choices: dict[str, Any]) -> Any:
-    """Return MuJoCo's constant for a field that names it. `ValueError` lists the choices."""
-    value = getattr(owner, field)
-    if value not in choices:
-        raise ValueError(
-            f"{type(owner).__name__}.{field} is {value!r}; it must be one of {list(choices)}."
+@dataclass
+class MaterialCfg(SpecCfg):
+    """Adds a material and, if patterns are given, puts it on geoms."""
+
+    name: str
+    """Name of the material."""
+    rgba: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
+    """Colour and opacity."""
+    texuniform: bool = False
+    """Repeat the texture per metre instead of per geom."""
+    texrepeat: tuple[float, float] = (1.0, 1.0)
+    """How often the texture is repeated."""
+    reflectance: float = 0.0
+    """Reflectance, 0 to 1."""
+    texture: str | None = None
+    """Name of the texture that gives the colour."""
+    geom_names_expr: tuple[str, ...] | None = None
+    """Patterns that choose the geoms, matched at the start of the name."""
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        """Add the material. Raises `ValueError` if a value is not valid."""
+        self.validate()
+        material = spec.add_material(
+            name=self.name,
+            rgba=self.rgba,
+            texuniform=self.texuniform,
+            texrepeat=self.texrepeat,
+            reflectance=self.reflectance,
         )
-    return choices[value]
+        if self.texture is not None:
+            material.textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = self.texture
+        if self.geom_names_expr is not None:
+            chosen = filter_exp(self.geom_names_expr, tuple(geom.name for geom in spec.geoms))
+            for geom in spec.geoms:
+                if geom.name in chosen:
+                    geom.material = self.name
 
-
-def find_body(owner: SpecCfg, spec: mujoco.MjSpec, name: str) -> mujoco.MjsBody:
-    """Return the body of that name ("world" is the world). `ValueError` lists the bodies."""
-    body = spec.worldbody if name == "world" else spec.body(name)
-    if body is None:
-        raise ValueError(
-            f"{type(owner).__name__} refers to the body {name!r}, which does not exist. "
-            f"Bodies: {[body.name for body in spec.bodies]}."
-        )
-    return body
-
-
-# MERGED mjlab.utils.spec_config: Editors of assets: textures, materials and meshes.
-
-_TEXTURE_TYPES = {
-    "2d": mujoco.mjtTexture.mjTEXTURE_2D,
-    "cube": mujoco.mjtTexture.mjTEXTURE_CUBE,
-    "skybox": mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-}
-_BUILTINS = {
-    "checker": mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-    "gradient": mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-    "flat": mujoco.mjtBuiltin.mjBUILTIN_FLAT,
-    "none": mujoco.mjtBuiltin.mjBUILTIN_NONE,
-}
-_MARKS = {
-    "edge": mujoco.mjtMark.mjMARK_EDGE,
-    "cross": mujoco.mjtMark.mjMARK_CROSS,
-    "random": mujoco.mjtMark.mjMARK_RANDOM,
-    "none": mujoco.mjtMark.mjMARK_NONE,
-}
-_CUBE_FACES = 6
+    def validate(self) -> None:
+        """Raise `ValueError` unless both repeats are positive."""
+        check_values(self, "texrepeat", lambda value: min(value) > 0, "two positive numbers")
 
 
 @dataclass
@@ -137,9 +256,9 @@ class TextureCfg(SpecCfg):
         self.validate()
         texture = spec.add_texture(
             name=self.name,
-            type=mujoco_enum(self, "type", _TEXTURE_TYPES),
-            builtin=mujoco_enum(self, "builtin", _BUILTINS),
-            mark=mujoco_enum(self, "mark", _MARKS),
+            type=mujoco_enum(self, "type", _TEXTURE),
+            builtin=mujoco_enum(self, "builtin", _BUILTIN),
+            mark=mujoco_enum(self, "mark", _MARK),
             markrgb=self.markrgb,
             random=self.random,
             nchannel=self.nchannel,
@@ -157,12 +276,8 @@ class TextureCfg(SpecCfg):
 
     def validate(self) -> None:
         """Raise `ValueError` for a texture without a source, a size or a face it needs."""
-        for field, choices in (
-            ("type", _TEXTURE_TYPES),
-            ("builtin", _BUILTINS),
-            ("mark", _MARKS),
-        ):
-            mujoco_enum(self, field, choices)
+        for field, enum in (("type", _TEXTURE), ("builtin", _BUILTIN), ("mark", _MARK)):
+            mujoco_enum(self, field, enum)
         for field in ("width", "height"):
             check_values(self, field, lambda value: value > 0, "positive")
         drawn = self.builtin != "none"
@@ -186,48 +301,6 @@ class TextureCfg(SpecCfg):
                 f"TextureCfg {self.name!r} is a skybox made from one image, but six faces are "
                 "needed: give `gridsize` and `gridlayout`, or six `cubefiles`."
             )
-
-
-@dataclass
-class MaterialCfg(SpecCfg):
-    """Adds a material and, if patterns are given, puts it on geoms."""
-
-    name: str
-    """Name of the material."""
-    rgba: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
-    """Colour and opacity."""
-    texuniform: bool = False
-    """Repeat the texture per metre instead of per geom."""
-    texrepeat: tuple[float, float] = (1.0, 1.0)
-    """How often the texture is repeated."""
-    reflectance: float = 0.0
-    """Reflectance, 0 to 1."""
-    texture: str | None = None
-    """Name of the texture that gives the colour."""
-    geom_names_expr: tuple[str, ...] | None = None
-    """Patterns that choose the geoms, matched at the start of the name."""
-
-    def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Add the material. Raises `ValueError` if a value is not valid."""
-        self.validate()
-        material = spec.add_material(
-            name=self.name,
-            rgba=self.rgba,
-            texuniform=self.texuniform,
-            texrepeat=self.texrepeat,
-            reflectance=self.reflectance,
-        )
-        if self.texture is not None:
-            material.textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = self.texture
-        if self.geom_names_expr is not None:
-            chosen = filter_exp(self.geom_names_expr, tuple(geom.name for geom in spec.geoms))
-            for geom in spec.geoms:
-                if geom.name in chosen:
-                    geom.material = self.name
-
-    def validate(self) -> None:
-        """Raise `ValueError` unless both repeats are positive."""
-        check_values(self, "texrepeat", lambda value: min(value) > 0, "two positive numbers")
 
 
 @dataclass
@@ -257,230 +330,6 @@ class MeshCfg(SpecCfg):
             lambda value: value == -1 or value > 3,
             "-1 or more than 3",
         )
-
-
-# MERGED mjlab.utils.spec_config: Editors of geoms: a patch of chosen attributes, and a complete collision setup.
-
-_REQUIRED = ("contype", "conaffinity", "condim", "priority")
-_ARRAYS = {"friction": 3, "solref": 2, "solimp": 5}
-_PATCHES = (*_ARRAYS, "margin", "gap", "solmix")
-_MAX_LISTED = 8
-
-
-@dataclass
-class GeomCfg(SpecCfg):
-    """A patch of geoms: what is None, or has no pattern that matches, stays as it is.
-
-    Every attribute is one value for all, or a dict of name pattern (matched at the start of the
-    name, the first in dict order counts) to value.
-    """
-
-    geom_names_expr: tuple[str, ...]
-    """Patterns that choose the geoms, matched at the start of the name."""
-    group: int | dict[str, int] | None = None
-    """Visualization group, 0 to 5."""
-    contype: int | dict[str, int] | None = None
-    """Collision type bits."""
-    conaffinity: int | dict[str, int] | None = None
-    """Bits of the collision types this geom collides with."""
-    condim: int | dict[str, int] | None = None
-    """Contact dimension: 1, 3, 4 or 6."""
-    priority: int | dict[str, int] | None = None
-    """The geom with the higher priority decides friction and solver parameters of a contact."""
-    friction: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
-    """Sliding, torsional and rolling friction; fewer values set the first ones."""
-    solref: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
-    """Contact solver reference; fewer values set the first ones."""
-    solimp: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
-    """Contact solver impedance; fewer values set the first ones."""
-    margin: float | dict[str, float] | None = None
-    """Distance (m) below which a contact is found."""
-    gap: float | dict[str, float] | None = None
-    """Distance (m) by which a contact found is inactive."""
-    solmix: float | dict[str, float] | None = None
-    """Weight, 0 to 1, for averaging the contact parameters of two geoms."""
-
-    def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Patch the geoms. Raises `ValueError` if a value is not valid."""
-        self.validate()
-        geoms = _matched_geoms(spec, self.geom_names_expr)
-        for field in ("group", *_REQUIRED, *_PATCHES):
-            _patch(geoms, field, getattr(self, field))
-
-    def validate(self) -> None:
-        """Raise `ValueError`, naming the field, the pattern and what is allowed."""
-        check_values(self, "group", lambda value: value in range(6), "from 0 to 5")
-        _validate_collision(self)
-
-
-@accepts_older_fields
-@dataclass
-class CollisionCfg(SpecCfg):
-    """The collision setup of an entity. Values are given as in `GeomCfg`.
-
-    The four required attributes are always written, so dicts should cover every geom chosen; what
-    no pattern names gets contype 1, conaffinity 1, condim 3 or priority 0, with a warning. The
-    others are patches.
-    """
-
-    geom_names_expr: tuple[str, ...]
-    """Patterns that choose the geoms, matched at the start of the name."""
-    contype: int | dict[str, int]
-    """Collision type bits."""
-    conaffinity: int | dict[str, int]
-    """Bits of the collision types these geoms collide with."""
-    condim: int | dict[str, int]
-    """Contact dimension: 1, 3, 4 or 6."""
-    priority: int | dict[str, int]
-    """The geom with the higher priority decides friction and solver parameters of a contact."""
-    friction: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
-    """Sliding, torsional and rolling friction; fewer values set the first ones."""
-    solref: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
-    """Contact solver reference; fewer values set the first ones."""
-    solimp: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
-    """Contact solver impedance; fewer values set the first ones."""
-    margin: float | dict[str, float] | None = None
-    """Distance (m) below which a contact is found."""
-    gap: float | dict[str, float] | None = None
-    """Distance (m) by which a contact found is inactive."""
-    solmix: float | dict[str, float] | None = None
-    """Weight, 0 to 1, for averaging the contact parameters of two geoms."""
-    disable_other_geoms: bool = True
-    """Switch off collisions of every geom that no pattern matches."""
-    set_array_field = staticmethod(set_array_field)
-
-    def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Write the setup. Raises `ValueError` if a value is not valid."""
-        self.validate()
-        geoms = _matched_geoms(spec, self.geom_names_expr)
-        for field, values in self._required_values([geom.name for geom in geoms]).items():
-            for geom, value in zip(geoms, values, strict=True):
-                setattr(geom, field, value)
-        for field in _PATCHES:
-            _patch(geoms, field, getattr(self, field))
-        if self.disable_other_geoms:
-            for geom in _other_geoms(spec, self.geom_names_expr):
-                geom.contype = geom.conaffinity = 0
-
-    def validate(self) -> None:
-        """Raise `ValueError`, naming the field, the pattern and what is allowed."""
-        for field in _REQUIRED:
-            if getattr(self, field) is None:
-                raise ValueError(f"CollisionCfg.{field} is None; it must have a value.")
-        _validate_collision(self)
-
-    def _required_values(self, names: Sequence[str]) -> dict[str, list[Any]]:
-        """Return the required attributes of the geoms `names`, by field."""
-        found = {field: resolve_field(getattr(self, field), tuple(names)) for field in _REQUIRED}
-        missing = {
-            field: [name for name, value in zip(names, values, strict=True) if value is None]
-            for field, values in found.items()
-        }
-        defaults = older_defaults(CollisionCfg, missing)
-        return {
-            field: [defaults[field] if value is None else value for value in values]
-            for field, values in found.items()
-        }
-
-
-def _validate_collision(cfg: GeomCfg | CollisionCfg) -> None:
-    for field in ("contype", "conaffinity", "priority", "margin", "gap"):
-        check_values(cfg, field, lambda value: value >= 0, "at least 0")
-    check_values(cfg, "condim", lambda value: value in (1, 3, 4, 6), "1, 3, 4 or 6")
-    check_values(cfg, "solmix", lambda value: 0 <= value <= 1, "from 0 to 1")
-    for field, size in _ARRAYS.items():
-        check_values(
-            cfg,
-            field,
-            lambda value, size=size: isinstance(value, (tuple, list)) and 1 <= len(value) <= size,
-            f"a tuple of 1 to {size} numbers",
-        )
-
-
-def _matched_geoms(spec: mujoco.MjSpec, patterns: Sequence[str]) -> list[mujoco.MjsGeom]:
-    chosen = set(filter_exp(tuple(patterns), tuple(geom.name for geom in spec.geoms)))
-    return [geom for geom in spec.geoms if geom.name in chosen]
-
-
-def _other_geoms(spec: mujoco.MjSpec, patterns: Sequence[str]) -> list[mujoco.MjsGeom]:
-    chosen = {geom.name for geom in _matched_geoms(spec, patterns)}
-    return [geom for geom in spec.geoms if geom.name not in chosen]
-
-
-def _patch(geoms: Sequence[mujoco.MjsGeom], field: str, value: Any) -> None:
-    if value is None:
-        return
-    values = resolve_field(value, tuple(geom.name for geom in geoms))
-    for geom, entry in zip(geoms, values, strict=True):
-        if entry is None:
-            continue
-        if field in _ARRAYS:
-            getattr(geom, field)[: len(entry)] = entry
-        else:
-            setattr(geom, field, entry)
-
-
-def warn_overlapping_geom_edits(
-    geom_cfgs: Sequence[GeomCfg],
-    collision_cfgs: Sequence[CollisionCfg],
-    spec: mujoco.MjSpec,
-) -> None:
-    """Warn (`UserWarning`) where a `CollisionCfg` overwrites what a `GeomCfg` sets.
-
-    Up to eight of them are listed as "geom.attribute".
-    """
-    patched = _edited_attributes(geom_cfgs, spec)
-    overwritten = _edited_attributes(collision_cfgs, spec)
-    for cfg in collision_cfgs:
-        if cfg.disable_other_geoms:
-            for geom in _other_geoms(spec, cfg.geom_names_expr):
-                overwritten |= {(geom.name, "contype"), (geom.name, "conaffinity")}
-    overlap = sorted(patched & overwritten)
-    if overlap:
-        listed = ", ".join(f"{geom}.{field}" for geom, field in overlap[:_MAX_LISTED])
-        more = len(overlap) - _MAX_LISTED
-        warnings.warn(
-            f"A CollisionCfg overwrites what a GeomCfg sets: {listed}"
-            + (f" and {more} more." if more > 0 else "."),
-            UserWarning,
-            stacklevel=2,
-        )
-
-
-def _edited_attributes(
-    cfgs: Sequence[GeomCfg] | Sequence[CollisionCfg], spec: mujoco.MjSpec
-) -> set[tuple[str, str]]:
-    edited = set()
-    for cfg in cfgs:
-        names = tuple(geom.name for geom in _matched_geoms(spec, cfg.geom_names_expr))
-        for field in (*_REQUIRED, *_PATCHES):
-            always = isinstance(cfg, CollisionCfg) and field in _REQUIRED
-            values = names if always else resolve_field(getattr(cfg, field), names)
-            edited |= {
-                (name, field)
-                for name, value in zip(names, values, strict=True)
-                if value is not None
-            }
-    return edited
-
-
-# MERGED mjlab.utils.spec_config: Editors that add lights and cameras.
-
-
-# The modes of lights and of cameras have the same names.
-_MODES = {
-    "fixed": mujoco.mjtCamLight.mjCAMLIGHT_FIXED,
-    "track": mujoco.mjtCamLight.mjCAMLIGHT_TRACK,
-    "trackcom": mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM,
-    "targetbody": mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY,
-    "targetbodycom": mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM,
-}
-_LIGHT_TYPES = {
-    "spot": mujoco.mjtLightType.mjLIGHT_SPOT,
-    "directional": mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-}
-_LIGHT_FIELDS = ("name", "castshadow", "pos", "dir", "cutoff", "exponent", "diffuse")
-_LIGHT_FIELDS += ("specular", "ambient", "active", "attenuation")
 
 
 @dataclass
@@ -522,10 +371,11 @@ class LightCfg(SpecCfg):
         """Add the light. Raises `ValueError`, with the choices, for an unknown body or mode."""
         self.validate()
         light = find_body(self, spec, self.body).add_light(
-            mode=mujoco_enum(self, "mode", _MODES),
-            type=mujoco_enum(self, "type", _LIGHT_TYPES),
+            mode=mujoco_enum(self, "mode", _CAM_LIGHT),
+            type=mujoco_enum(self, "type", _LIGHT),
         )
-        _set_target(self, spec, light)
+        if self.target is not None:
+            light.targetbody = find_body(self, spec, self.target).name
         for field in _LIGHT_FIELDS:
             value = getattr(self, field)
             if value is not None:
@@ -533,7 +383,7 @@ class LightCfg(SpecCfg):
 
     def validate(self) -> None:
         """Raise `ValueError` for an unknown mode or type, or a mode without its target."""
-        mujoco_enum(self, "type", _LIGHT_TYPES)
+        check_one_of("LightCfg.type", self.type, ("spot", "directional"))
         _validate_mode(self)
 
 
@@ -561,20 +411,103 @@ class CameraCfg(SpecCfg):
         self.validate()
         camera = find_body(self, spec, self.body).add_camera(
             name=self.name,
-            mode=mujoco_enum(self, "mode", _MODES),
+            mode=mujoco_enum(self, "mode", _CAM_LIGHT),
             fovy=self.fovy,
             pos=self.pos,
             quat=self.quat,
         )
-        _set_target(self, spec, camera)
+        if self.target is not None:
+            camera.targetbody = find_body(self, spec, self.target).name
 
     def validate(self) -> None:
         """Raise `ValueError` for an unknown mode, or one without its target."""
         _validate_mode(self)
 
 
+def warn_overlapping_geom_edits(
+    geom_cfgs: Sequence[GeomCfg],
+    collision_cfgs: Sequence[CollisionCfg],
+    spec: mujoco.MjSpec,
+) -> None:
+    """Warn (`UserWarning`) where a `CollisionCfg` overwrites what a `GeomCfg` sets.
+
+    Up to eight of them are listed as "geom.attribute".
+    """
+    patched = _edited_attributes(geom_cfgs, spec)
+    overwritten = _edited_attributes(collision_cfgs, spec)
+    for cfg in collision_cfgs:
+        if cfg.disable_other_geoms:
+            _, others = _split_geoms(spec, cfg.geom_names_expr)
+            for geom in others:
+                overwritten |= {(geom.name, "contype"), (geom.name, "conaffinity")}
+    overlap = sorted(patched & overwritten)
+    if overlap:
+        listed = ", ".join(f"{geom}.{field}" for geom, field in overlap[:_MAX_LISTED])
+        more = len(overlap) - _MAX_LISTED
+        warnings.warn(
+            f"A CollisionCfg overwrites what a GeomCfg sets: {listed}"
+            + (f" and {more} more." if more > 0 else "."),
+            UserWarning,
+            stacklevel=2,
+        )
+
+
+def _edited_attributes(
+    cfgs: Sequence[GeomCfg] | Sequence[CollisionCfg], spec: mujoco.MjSpec
+) -> set[tuple[str, str]]:
+    edited = set()
+    for cfg in cfgs:
+        geoms, _ = _split_geoms(spec, cfg.geom_names_expr)
+        names = tuple(geom.name for geom in geoms)
+        for field in (*_REQUIRED, *_PATCHES):
+            always = isinstance(cfg, CollisionCfg) and field in _REQUIRED
+            values = names if always else resolve_field(getattr(cfg, field), names)
+            edited |= {
+                (name, field)
+                for name, value in zip(names, values, strict=True)
+                if value is not None
+            }
+    return edited
+
+
+def _split_geoms(
+    spec: mujoco.MjSpec, patterns: Sequence[str]
+) -> tuple[list[mujoco.MjsGeom], list[mujoco.MjsGeom]]:
+    """Return the geoms that a pattern matches, and the others."""
+    chosen = set(filter_exp(tuple(patterns), tuple(geom.name for geom in spec.geoms)))
+    matched = [geom for geom in spec.geoms if geom.name in chosen]
+    return matched, [geom for geom in spec.geoms if geom.name not in chosen]
+
+
+def _patch(geoms: Sequence[mujoco.MjsGeom], field: str, value: Any) -> None:
+    if value is None:
+        return
+    values = resolve_field(value, tuple(geom.name for geom in geoms))
+    for geom, entry in zip(geoms, values, strict=True):
+        if entry is None:
+            continue
+        if field in _ARRAYS:
+            getattr(geom, field)[: len(entry)] = entry
+        else:
+            setattr(geom, field, entry)
+
+
+def _validate_collision(cfg: GeomCfg | CollisionCfg) -> None:
+    for field in ("contype", "conaffinity", "priority", "margin", "gap"):
+        check_values(cfg, field, lambda value: value >= 0, "at least 0")
+    check_values(cfg, "condim", lambda value: value in (1, 3, 4, 6), "1, 3, 4 or 6")
+    check_values(cfg, "solmix", lambda value: 0 <= value <= 1, "from 0 to 1")
+    for field, size in _ARRAYS.items():
+        check_values(
+            cfg,
+            field,
+            lambda value, size=size: isinstance(value, (tuple, list)) and 1 <= len(value) <= size,
+            f"a tuple of 1 to {size} numbers",
+        )
+
+
 def _validate_mode(cfg: LightCfg | CameraCfg) -> None:
-    mujoco_enum(cfg, "mode", _MODES)
+    mujoco_enum(cfg, "mode", _CAM_LIGHT)
     if cfg.mode.startswith("target") and cfg.target is None:
         raise ValueError(
             f"{type(cfg).__name__} {cfg.name!r} has mode {cfg.mode!r}, which needs `target`, the "
@@ -582,23 +515,24 @@ def _validate_mode(cfg: LightCfg | CameraCfg) -> None:
         )
 
 
-def _set_target(cfg: LightCfg | CameraCfg, spec: mujoco.MjSpec, element: Any) -> None:
-    if cfg.target is not None:
-        find_body(cfg, spec, cfg.target)
-        element.targetbody = cfg.target
+def check_values(owner: SpecCfg, field: str, is_valid: Callable[[Any], bool], allowed: str) -> None:
+    """Raise `ValueError` unless each value of a field (scalar, or dict by pattern) is valid."""
+    given = getattr(owner, field)
+    by_pattern = given if isinstance(given, dict) else {None: given}
+    for pattern, value in by_pattern.items():
+        if value is not None and not is_valid(value):
+            where = "" if pattern is None else f" for pattern {pattern!r}"
+            raise ValueError(
+                f"{type(owner).__name__}.{field} is {value!r}{where}; it must be {allowed}."
+            )
 
 
-# MERGED mjlab.utils.spec_config: The editors behind `mjlab.utils.spec_config`, by what they edit.
+def mujoco_enum(owner: SpecCfg, field: str, enum: tuple[Any, str]) -> int:
+    """Return MuJoCo's constant for a field that names it. `ValueError` lists the choices."""
+    return enum_value(f"{type(owner).__name__}.{field}", getattr(owner, field), *enum)
 
 
-__all__ = [
-    "CameraCfg",
-    "CollisionCfg",
-    "GeomCfg",
-    "LightCfg",
-    "MaterialCfg",
-    "MeshCfg",
-    "SpecCfg",
-    "TextureCfg",
-    "warn_overlapping_geom_edits",
-]
+def find_body(owner: SpecCfg, spec: mujoco.MjSpec, name: str) -> mujoco.MjsBody:
+    """Return the body of that name ("world" is the world). `ValueError` lists the bodies."""
+    check_exists(f"{type(owner).__name__} body", name, [body.name for body in spec.bodies])
+    return spec.body(name)

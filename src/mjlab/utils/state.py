@@ -17,9 +17,7 @@ import numpy as np
 import torch
 
 logger = logging.getLogger(__name__)
-
 C = TypeVar("C", bound=type)
-
 _MARK = "_is_stateful"
 # Marks what was captured from an object, to tell it from a plain dict.
 _CLASS_KEY = "__class__"
@@ -52,24 +50,6 @@ def is_stateful(obj: Any) -> bool:
     return getattr(type(obj), _MARK, False)
 
 
-def plain_scalar(value: Any) -> Any:
-    """Return `value` as exactly None, bool, int, float or str, or `SKIP` if it is none of these.
-
-    Subclasses (numpy's numbers above all) are converted, because a checkpoint that holds them
-    cannot be loaded as plain data.
-    """
-    if value is None:
-        return None
-    if isinstance(value, enum.Enum):
-        return SKIP
-    if isinstance(value, np.generic):
-        value = value.item()
-    for kind in (bool, int, float, str):
-        if isinstance(value, kind):
-            return kind(value)
-    return SKIP
-
-
 def capture_state(obj: Any, *, generators: bool = True) -> dict[str, Any]:
     """Return a copy of the run-time state of `obj`, whose class is marked `stateful`.
 
@@ -94,7 +74,8 @@ def restore_state(obj: Any, state: dict[str, Any]) -> None:
         if name in transient or name == _CLASS_KEY:
             continue
         current = obj.__dict__.get(name)
-        if _is_captured_object(value) and not is_stateful(current):
+        is_object = isinstance(value, dict) and _CLASS_KEY in value
+        if is_object and not is_stateful(current):
             logger.warning(
                 "%s.%s is not restored: it was a %s and is %r now.",
                 type(obj).__name__, name, value[_CLASS_KEY], current,
@@ -123,15 +104,22 @@ def shape_differences(saved: Any, current: Any, path: str = "") -> list[str]:
     return []
 
 
-def _is_captured_object(value: Any) -> bool:
-    return isinstance(value, dict) and _CLASS_KEY in value
+def plain_scalar(value: Any) -> Any:
+    """Return `value` as exactly None, bool, int, float or str, or `SKIP` if it is none of these.
 
-
-def _transient_names(cls: type) -> set[str]:
-    names: set[str] = set(_SETTINGS)
-    for base in cls.__mro__:
-        names |= set(base.__dict__.get(_TRANSIENT, ()))
-    return names
+    Subclasses (numpy's numbers above all) are converted, because a checkpoint that holds them
+    cannot be loaded as plain data.
+    """
+    if value is None:
+        return None
+    if isinstance(value, enum.Enum):
+        return SKIP
+    if isinstance(value, np.generic):
+        value = value.item()
+    for kind in (bool, int, float, str):
+        if isinstance(value, kind):
+            return kind(value)
+    return SKIP
 
 
 def _capture_object(obj: Any, seen: set[int], generators: bool) -> dict[str, Any]:
@@ -166,16 +154,12 @@ def _capture_value(value: Any, seen: set[int], generators: bool) -> Any:
             return SKIP
         return [None if item is SKIP else item for item in items]
     if isinstance(value, dict):
-        return _capture_dict(value, seen, generators)
+        if not all(type(key) in (str, int) for key in value):
+            return SKIP
+        entries = {key: _capture_value(item, seen, generators) for key, item in value.items()}
+        kept = {key: item for key, item in entries.items() if item is not SKIP}
+        return SKIP if value and not kept else kept
     return plain_scalar(value)
-
-
-def _capture_dict(value: dict[Any, Any], seen: set[int], generators: bool) -> Any:
-    if not all(type(key) in (str, int) for key in value):
-        return SKIP
-    entries = {key: _capture_value(item, seen, generators) for key, item in value.items()}
-    kept = {key: item for key, item in entries.items() if item is not SKIP}
-    return SKIP if value and not kept else kept
 
 
 def _owns_its_values(tensor: torch.Tensor) -> bool:
@@ -195,7 +179,11 @@ def _restored(current: Any, saved: Any) -> Any:
         restore_state(current, saved)
         return current
     if type(current) in _SEQUENCES and isinstance(saved, list):
-        return _restored_sequence(current, saved)
+        if len(current) == len(saved):
+            saved = [_restored(item, value) for item, value in zip(current, saved, strict=True)]
+        if isinstance(current, deque):
+            return deque(saved, maxlen=current.maxlen)
+        return type(current)(saved)
     if isinstance(current, dict) and isinstance(saved, dict):
         for key, value in saved.items():
             current[key] = _restored(current.get(key), value)
@@ -204,14 +192,6 @@ def _restored(current: Any, saved: Any) -> Any:
     if saved is None and not isinstance(current, torch.Tensor) and plain_scalar(current) is SKIP:
         return current
     return saved
-
-
-def _restored_sequence(current: Any, saved: list[Any]) -> Any:
-    if len(current) == len(saved):
-        saved = [_restored(item, value) for item, value in zip(current, saved, strict=True)]
-    if isinstance(current, deque):
-        return deque(saved, maxlen=current.maxlen)
-    return type(current)(saved)
 
 
 def _restored_tensor(current: Any, saved: torch.Tensor) -> Any:
@@ -229,3 +209,10 @@ def _restored_tensor(current: Any, saved: torch.Tensor) -> Any:
         return saved.to(current.device)
     current.copy_(saved)
     return current
+
+
+def _transient_names(cls: type) -> set[str]:
+    names: set[str] = set(_SETTINGS)
+    for base in cls.__mro__:
+        names |= set(base.__dict__.get(_TRANSIENT, ()))
+    return names

@@ -1,7 +1,9 @@
-"""Corrections to the XML that MuJoCo writes for a spec."""
+"""A spec as XML and files: export, files in memory, corrections to the XML that MuJoCo writes."""
 
 from __future__ import annotations
 
+import functools
+import operator
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -11,8 +13,95 @@ from xml.etree import ElementTree
 
 import mujoco
 
+_ASSETS = "assets"
+_XML_NAME = "scene.xml"
 _RGB_ROLE = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 _STAND_IN = "mjlab_without_texture"
+
+
+def export_spec(spec: mujoco.MjSpec, output_dir: Path, *, zip: bool = False) -> None:
+    """Write `scene.xml` and, under `assets/`, the files it refers to. `spec` is not changed.
+
+    Textures made from raw pixels are left out, with the materials that use them, because XML
+    cannot hold them. With `zip` the result is the archive `<output_dir>.zip` instead of a folder.
+
+    Raises `ValueError` if a file cannot be found, or if the spec has been attached to another one.
+    """
+    if spec.parent is not None:
+        # MuJoCo would end the process.
+        raise ValueError(
+            f"The spec {spec.modelname!r} has been attached to another one, and MuJoCo cannot "
+            "write it any more. Write the whole (`spec.parent`), or a copy made before attaching."
+        )
+    output_dir = Path(output_dir)
+    if not zip:
+        _write_folder(spec, output_dir)
+        return
+    output_dir.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as temporary:
+        # Not named after `output_dir`, whose last part may be "..".
+        folder = Path(temporary) / "scene"
+        _write_folder(spec, folder)
+        shutil.make_archive(str(output_dir), "zip", root_dir=folder)
+
+
+def _write_folder(spec: mujoco.MjSpec, folder: Path) -> None:
+    # Everything that can fail comes before the first file is written.
+    copy = spec.copy()
+    strip_buffer_textures(copy)
+    contents: dict[str, bytes] = {}
+    names: list[tuple[_FilePlace, str]] = []
+    for place in _file_places(copy):
+        content = _read(copy, place, spec.modelfiledir)
+        names.append((place, _unique_name(place, content, contents)))
+        contents[names[-1][1]] = content
+    for place, name in names:
+        place.rename(name)
+    copy.meshdir = copy.texturedir = ""
+    copy.assets = contents
+    xml = fix_spec_xml(copy.to_xml(), meshdir=_ASSETS if contents else None)
+    for name, content in contents.items():
+        path = folder / _ASSETS / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / _XML_NAME).write_text(xml)
+
+
+def make_asset_paths_absolute(spec: mujoco.MjSpec, model_dir: str | None = None) -> None:
+    """Turn relative paths of files on disk into absolute ones. Changes `spec`.
+
+    Attaching forgets the folder a spec was read from, so do this before. Paths that are keys of
+    `spec.assets`, or lead to no file, are left alone.
+
+    Args:
+        spec: The spec.
+        model_dir: The folder of its XML file; None takes `spec.modelfiledir`.
+    """
+    model_dir = spec.modelfiledir if model_dir is None else model_dir
+    for place in _file_places(spec):
+        if _asset_key(spec, place) is None and not PurePosixPath(place.path).is_absolute():
+            path = Path(model_dir, place.folder, place.path).absolute()
+            if path.is_file():
+                place.rename(str(path))
+
+
+def put_files_in_memory(spec: mujoco.MjSpec, prefix: str) -> None:
+    """Bring all files that a spec refers to into `spec.assets`, as `<prefix><file>`. Changes `spec`.
+
+    Specs that are merged need that if one of them has files in memory: attaching a spec with such
+    files renames those on disk too, and a path on disk may be taken for a file in memory that ends
+    alike.
+
+    Raises `ValueError` if a file cannot be found.
+    """
+    contents: dict[str, bytes] = {}
+    for place in list(_file_places(spec)):
+        content = _read(spec, place, spec.modelfiledir)
+        name = _unique_name(place, content, contents)
+        contents[name] = content
+        place.rename(prefix + name.replace("/", "_"))
+    spec.assets = {prefix + name.replace("/", "_"): contents[name] for name in contents}
 
 
 def fix_spec_xml(xml: str, meshdir: str | None = None) -> str:
@@ -53,20 +142,16 @@ def _clean_default(default: ElementTree.Element, used: set[str | None]) -> None:
         inner = child.get("class", "main")
         if inner == name:
             default.remove(child)
-            _merge_default(default, child)
+            for element in child:
+                same = None if element.tag == "default" else default.find(element.tag)
+                if same is None:
+                    default.append(element)
+                else:
+                    # Where both set an attribute, the inner value counts.
+                    same.attrib.update(element.attrib)
         elif len(child) == 0 and inner not in used:
             # An empty class that something refers to has to stay: it inherits.
             default.remove(child)
-
-
-def _merge_default(outer: ElementTree.Element, inner: ElementTree.Element) -> None:
-    """Move what `inner` sets into `outer`; where both set an attribute, the inner value counts."""
-    for element in inner:
-        same = None if element.tag == "default" else outer.find(element.tag)
-        if same is None:
-            outer.append(element)
-        else:
-            same.attrib.update(element.attrib)
 
 
 def strip_buffer_textures(spec: mujoco.MjSpec) -> None:
@@ -78,7 +163,12 @@ def strip_buffer_textures(spec: mujoco.MjSpec) -> None:
     Where MuJoCo will not let go of a reference, those geoms get a material without a texture that
     looks like none.
     """
-    textures = {t.name: t for t in spec.textures if _has_only_pixels(t)}
+    no_builtin = mujoco.mjtBuiltin.mjBUILTIN_NONE
+    textures = {
+        t.name: t
+        for t in spec.textures
+        if len(t.data) > 0 and not t.file and not any(t.cubefiles) and t.builtin == no_builtin
+    }
     materials = {m.name: m for m in spec.materials if m.textures[_RGB_ROLE] in textures}
     geoms = [geom for geom in spec.geoms if geom.material in materials]
     for geom in geoms:
@@ -103,83 +193,6 @@ def _can_be_written(spec: mujoco.MjSpec) -> bool:
     return True
 
 
-def _has_only_pixels(texture: mujoco.MjsTexture) -> bool:
-    has_source = (
-        texture.file
-        or any(texture.cubefiles)
-        or texture.builtin != mujoco.mjtBuiltin.mjBUILTIN_NONE
-    )
-    return not has_source and len(texture.data) > 0
-
-
-# MERGED mjlab.utils.xml: Writing a spec as a folder (or archive) that holds its XML and every file it refers to.
-
-_ASSETS = "assets"
-_XML_NAME = "scene.xml"
-
-
-def export_spec(spec: mujoco.MjSpec, output_dir: Path, *, zip: bool = False) -> None:
-    """Write `scene.xml` and, under `assets/`, the files it refers to. `spec` is not changed.
-
-    Textures made from raw pixels are left out, with the materials that use them, because XML
-    cannot hold them. With `zip` the result is the archive `<output_dir>.zip` instead of a folder.
-
-    Raises `ValueError` if a file cannot be found, or if the spec has been attached to another one.
-    """
-    if spec.parent is not None:
-        # MuJoCo would end the process.
-        raise ValueError(
-            f"The spec {spec.modelname!r} has been attached to another one, and MuJoCo cannot "
-            "write it any more. Write the whole (`spec.parent`), or a copy made before attaching."
-        )
-    output_dir = Path(output_dir)
-    if not zip:
-        _write_folder(spec, output_dir)
-        return
-    output_dir.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as temporary:
-        # Not named after `output_dir`, whose last part may be "..".
-        folder = Path(temporary) / "scene"
-        _write_folder(spec, folder)
-        shutil.make_archive(str(output_dir), "zip", root_dir=folder)
-
-
-def make_asset_paths_absolute(spec: mujoco.MjSpec, model_dir: str | None = None) -> None:
-    """Turn relative paths of files on disk into absolute ones. Changes `spec`.
-
-    Attaching forgets the folder a spec was read from, so do this before. Paths that are keys of
-    `spec.assets`, or lead to no file, are left alone.
-
-    Args:
-        spec: The spec.
-        model_dir: The folder of its XML file; None takes `spec.modelfiledir`.
-    """
-    model_dir = spec.modelfiledir if model_dir is None else model_dir
-    for place in _file_places(spec):
-        if _asset_key(spec, place) is None and not PurePosixPath(place.path).is_absolute():
-            path = Path(model_dir, place.folder, place.path).absolute()
-            if path.is_file():
-                place.rename(str(path))
-
-
-def put_files_in_memory(spec: mujoco.MjSpec, prefix: str) -> None:
-    """Bring all files that a spec refers to into `spec.assets`, as `<prefix><file>`. Changes `spec`.
-
-    Specs that are merged need that if one of them has files in memory: attaching a spec with such
-    files renames those on disk too, and a path on disk may be taken for a file in memory that ends
-    alike.
-
-    Raises `ValueError` if a file cannot be found.
-    """
-    contents: dict[str, bytes] = {}
-    for place in list(_file_places(spec)):
-        content = _read(spec, place, spec.modelfiledir)
-        name = _unique_name(place, content, contents)
-        contents[name] = content
-        place.rename(prefix + name.replace("/", "_"))
-    spec.assets = {prefix + name.replace("/", "_"): contents[name] for name in contents}
-
-
 class _FilePlace:
     """One attribute of one element that names a file."""
 
@@ -198,7 +211,8 @@ class _FilePlace:
 
 def _file_places(spec: mujoco.MjSpec) -> Iterator[_FilePlace]:
     def place(element: Any, folder: str) -> _FilePlace:
-        return _FilePlace(element, element.file, folder, lambda new: setattr(element, "file", new))
+        write = functools.partial(setattr, element, "file")
+        return _FilePlace(element, element.file, folder, write)
 
     for element in (*spec.meshes, *spec.hfields, *spec.skins):
         if element.file:
@@ -209,26 +223,8 @@ def _file_places(spec: mujoco.MjSpec) -> Iterator[_FilePlace]:
             yield place(texture, folder)
         for side, path in enumerate(texture.cubefiles):
             if path:
-                yield _FilePlace(texture, path, folder, _cube_writer(texture, side))
-
-
-def _cube_writer(texture: mujoco.MjsTexture, side: int) -> Callable[[str], None]:
-    def write(path: str) -> None:
-        texture.cubefiles[side] = path
-
-    return write
-
-
-def _asset_key(spec: mujoco.MjSpec, place: _FilePlace) -> str | None:
-    """Return the key of `spec.assets` for a path: itself, in its folder, or one that ends so."""
-    keys = spec.assets.keys()
-    for key in (place.path, str(PurePosixPath(place.folder, place.path))):
-        if key in keys:
-            return key
-    endings = [key for key in keys if key.endswith("/" + place.path)]
-    # A name in the file's own folder is the better match where several end alike.
-    endings.sort(key=lambda key: (place.folder not in key, key))
-    return endings[0] if endings else None
+                write = functools.partial(operator.setitem, texture.cubefiles, side)
+                yield _FilePlace(texture, path, folder, write)
 
 
 def _read(spec: mujoco.MjSpec, place: _FilePlace, model_dir: str) -> bytes:
@@ -247,27 +243,16 @@ def _read(spec: mujoco.MjSpec, place: _FilePlace, model_dir: str) -> bytes:
     return path.read_bytes()
 
 
-def _write_folder(spec: mujoco.MjSpec, folder: Path) -> None:
-    # Everything that can fail comes before the first file is written.
-    copy = spec.copy()
-    strip_buffer_textures(copy)
-    contents: dict[str, bytes] = {}
-    names: list[tuple[_FilePlace, str]] = []
-    for place in _file_places(copy):
-        content = _read(copy, place, spec.modelfiledir)
-        names.append((place, _unique_name(place, content, contents)))
-        contents[names[-1][1]] = content
-    for place, name in names:
-        place.rename(name)
-    copy.meshdir = copy.texturedir = ""
-    copy.assets = contents
-    xml = fix_spec_xml(copy.to_xml(), meshdir=_ASSETS if contents else None)
-    for name, content in contents.items():
-        path = folder / _ASSETS / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / _XML_NAME).write_text(xml)
+def _asset_key(spec: mujoco.MjSpec, place: _FilePlace) -> str | None:
+    """Return the key of `spec.assets` for a path: itself, in its folder, or one that ends so."""
+    keys = spec.assets.keys()
+    for key in (place.path, str(PurePosixPath(place.folder, place.path))):
+        if key in keys:
+            return key
+    endings = [key for key in keys if key.endswith("/" + place.path)]
+    # A name in the file's own folder is the better match where several end alike.
+    endings.sort(key=lambda key: (place.folder not in key, key))
+    return endings[0] if endings else None
 
 
 def _unique_name(place: _FilePlace, content: bytes, taken: dict[str, bytes]) -> str:

@@ -12,13 +12,13 @@ from tracking_tasks import G1, part_of, task_cfg, unperturbed
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl import RslRlVecEnvWrapper
 from mjlab.rl.evaluation import evaluate_policy
-from mjlab.scripts.cli import UserError
-from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
+from mjlab.scripts.evaluate import EvaluateConfig, run_evaluate
 from mjlab.tasks.registry import load_rl_cfg
 from mjlab.tasks.tracking.mdp.metrics import TRACKING_ERRORS, play_motions_once
 from mjlab.tasks.tracking.motion_file import read_motion
 from mjlab.tasks.tracking.motion_sources import shipped_motions
 from mjlab.tasks.tracking.options import MotionOptions
+from mjlab.utils.errors import UserError
 
 
 @pytest.fixture

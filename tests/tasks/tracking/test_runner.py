@@ -18,7 +18,7 @@ from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import CommandTerm, CommandTermCfg
 from mjlab.rl import RslRlVecEnvWrapper
 from mjlab.rl.onnx_policy import OnnxPolicyError, load_onnx_policy
-from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
+from mjlab.scripts.evaluate import EvaluateConfig, run_evaluate
 from mjlab.tasks.registry import load_rl_cfg, load_runner_cls
 from mjlab.tasks.tracking.motion_file import MotionFileError
 from mjlab.tasks.tracking.motion_sources import record_motions, recorded_motions, shipped_motions

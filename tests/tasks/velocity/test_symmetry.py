@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import ObservationTermCfg, SceneEntityCfg
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
-from mjlab.scripts.train_run import parse_train_flags
+from mjlab.scripts.train import parse_train_flags
 from mjlab.sensor import BuiltinSensorCfg, GridPatternCfg, ObjRef, RayCastSensorCfg
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.tasks.velocity import mdp

@@ -221,10 +221,10 @@ def test_draws_come_from_the_generator():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"min_lag": -1}, "min_lag is -1"),
-        ({"min_lag": 3, "max_lag": 2}, "max_lag is 2; it must be at least min_lag, 3"),
-        ({"hold_prob": 1.5}, "hold_prob is 1.5"),
-        ({"update_period": -1}, "update_period is -1"),
+        ({"min_lag": -1}, "min_lag.*-1"),
+        ({"min_lag": 3, "max_lag": 2}, "max_lag.*3.*2"),
+        ({"hold_prob": 1.5}, "hold_prob.*1.5"),
+        ({"update_period": -1}, "update_period.*-1"),
     ],
 )
 def test_values_out_of_range_are_refused(options, message):

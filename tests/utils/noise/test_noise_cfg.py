@@ -115,12 +115,12 @@ def test_cached_tensors_can_take_part_in_gradients():
     ],
 )
 def test_values_out_of_range_are_refused(make):
-    with pytest.raises(ValueError, match="must be"):
+    with pytest.raises(ValueError, match="must be|expected"):
         make()
 
 
 def test_an_operation_that_became_invalid_is_refused():
     cfg = ConstantNoiseCfg()
     cfg.operation = "mul"  # ty: ignore[invalid-assignment]
-    with pytest.raises(ValueError, match=r"'mul'; it must be one of \['add', 'scale', 'abs'\]"):
+    with pytest.raises(ValueError, match=r"\['add', 'scale', 'abs'\].*'mul'"):
         cfg.apply(DATA)

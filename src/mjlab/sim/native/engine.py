@@ -38,6 +38,7 @@ from mjlab.sim.engine import (
 from mjlab.sim.native.rays import NativeRays
 from mjlab.sim.native.render import NativeRenderer, render_problem
 from mjlab.sim.randomization import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
+from mjlab.utils.errors import UnknownAttributeError, check_count
 from mjlab.utils.processes import cores_per_process
 
 if TYPE_CHECKING:
@@ -114,10 +115,7 @@ class NativeEngine(Engine):
     def __init__(
         self, model: mujoco.MjModel, num_envs: int, cfg: SimulationCfg, device: str
     ) -> None:
-        if cfg.num_threads < 0:
-            raise ValueError(
-                f"SimulationCfg.num_threads is {cfg.num_threads}; give 0 for all cores, or more."
-            )
+        check_count("SimulationCfg.num_threads", cfg.num_threads, 0)
         self.num_envs = num_envs
         self._model = copy.copy(model)
         # MuJoCo would put a diverged environment back to qpos0 by itself and hide the NaN from
@@ -168,12 +166,14 @@ class NativeEngine(Engine):
     def data_field(self, name: str) -> torch.Tensor:
         if name not in self._tensors:
             if name in ("contact", "nacon"):
-                raise AttributeError(
+                raise UnknownAttributeError(
                     f"The native engine does not offer sim.data.{name}; use a contact sensor "
                     "(ContactSensorCfg)."
                 )
             if name not in DATA_FIELDS:
-                raise AttributeError(f"The native engine: {_reason(self._batch.bind, name)}.")
+                raise UnknownAttributeError(
+                    f"The native engine: {_reason(self._batch.bind, name)}."
+                )
             check_sensor_fed(self._model, name)
             source = _as_tensor(self._batch.bind(name))
             dtype = torch.bool if name == "eq_active" else _seam_type(source)

@@ -459,7 +459,14 @@ class GroundTable:
         versions = {name: fields[name]._version for name in self._compiled if name in fields}
         if versions != self._seen:
             self._seen = versions
-            differing = [name for name in versions if self._differs(name, fields[name])]
+            differing = []
+            for name in versions:
+                ids, compiled = self._compiled[name]
+                own = fields[name][:, ids].numpy()
+                if name.endswith("rgba"):
+                    own, compiled = own[..., 3] == 0.0, compiled[:, 3] == 0.0
+                if (own != compiled.astype(own.dtype)).any():
+                    differing.append(name)
             self._is_current = not differing
             if differing and not self._has_warned:
                 self._has_warned = True
@@ -471,13 +478,6 @@ class GroundTable:
                     differing[0],
                 )
         return self._is_current
-
-    def _differs(self, name: str, field: torch.Tensor) -> bool:
-        ids, compiled = self._compiled[name]
-        own = field[:, ids].numpy()
-        if name.endswith("rgba"):
-            own, compiled = own[..., 3] == 0.0, compiled[:, 3] == 0.0
-        return bool((own != compiled.astype(own.dtype)).any())
 
 
 def _static_fields(model: mujoco.MjModel, geoms: Array) -> dict[str, tuple[Array, Array]]:

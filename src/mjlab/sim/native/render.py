@@ -7,7 +7,7 @@ few geoms stand for those in its sight. Everything is in the frame of the camera
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from mjlab.sim.engine import BACKGROUND, LENS_FIELDS, CameraView, Engine, Images, rendered_geoms
 from mjlab.sim.native.rays import CullingRule, Hits, Passed, cast_through
-from mjlab.sim.native.textures import (
+from mjlab.sim.native.shading import (
     BOX,
     CAPSULE,
     CYLINDER,
@@ -31,9 +31,11 @@ from mjlab.sim.native.textures import (
     MESH,
     PLANE,
     SPHERE,
-    Textures,
+    Geoms,
+    ReadField,
+    Shading,
+    Surfaces,
     of_materials,
-    of_pixels,
 )
 from mjlab.utils.lab_api.math import matrix_from_quat, quat_conjugate, quat_from_matrix, quat_mul
 
@@ -43,8 +45,6 @@ _GEOM_TYPE = int(mujoco.mjtObj.mjOBJ_GEOM)
 
 MakeBatch = Callable[..., Batch]
 """`make_batch(model, count)` makes a batch of simulations; `num_threads=` is optional."""
-ReadField = Callable[[str], Tensor]
-"""A field of `MjData` or `MjModel` by name, of n environments: (n, ...), (1, ...) if they share it."""
 
 
 class NativeRenderer:
@@ -131,46 +131,6 @@ def render_problem(model: mujoco.MjModel) -> str | None:
     )
 
 
-@dataclass
-class Geoms:
-    """G geoms in the frame of the camera, in n environments."""
-
-    pos: Tensor
-    """Position, (n, G, 3)."""
-    quat: Tensor
-    """Orientation, (n, G, 4)."""
-    mat: Tensor
-    """Orientation, (n, G, 3, 3)."""
-    size: Tensor
-    """Size, (n, G, 3)."""
-    center: Tensor
-    """Center of a box around the geom, in the frame of the geom, (n, G, 3)."""
-    half: Tensor
-    """Half extents of the box, (n, G, 3)."""
-    dataid: Tensor
-    """Height field or mesh, or -1, (n, G) int32."""
-    material: Tensor
-    """Material, -1 for none, (1 or n, G)."""
-    rgba: Tensor
-    """Color, (1 or n, G, 4)."""
-    exists: Tensor
-    """True where an environment has the geom and it is not fully transparent, (n, G) bool."""
-
-
-@dataclass
-class Surfaces:
-    """Hits of n x P rays, in the camera frame."""
-
-    directions: Tensor
-    """Unit vectors along the rays, (3, 1 or n, P)."""
-    points: Tensor
-    """Positions, (3, n, P)."""
-    normals: Tensor
-    """Unit normals, (3, n, P)."""
-    columns: Tensor
-    """Number of the geom among those that are rendered, (n, P); G for nothing."""
-
-
 class _View:
     """Renderer of one view, on one thread."""
 
@@ -197,7 +157,7 @@ class _View:
         self._slots = make_slots(rows * self._lens.num_tiles, self._lens.tile_rays)
         # Shadow rays go past all geoms, not those in sight of a tile.
         self._shadow_slots = make_slots(rows, self._lens.num_rays) if view.use_shadows else None
-        self._shading = _Shading(model, kinds, view.use_textures)
+        self._shading = Shading(model, kinds, view.use_textures)
         self._aimed: _Rays | None = None
         self._rule = CullingRule(model, self._ids[:-1].numpy())
         self._has_fields = HFIELD in kinds
@@ -595,154 +555,3 @@ def _slot_model(model: mujoco.MjModel, kinds: set[int], slots: int) -> mujoco.Mj
     # MuJoCo 4 lets rays pass geoms whose bounding sphere they miss; 0 is for no bound.
     compiled.geom_rbound[:] = 0.0
     return compiled
-
-
-# What a geom without a material reflects, and its shininess; the exponent of a shininess of 1.
-_SPECULAR, _SHININESS, _MAX_EXPONENT = 0.5, 0.5, 128.0
-# Part of a light that reaches what is in its shadow, and ambient light where there is no light.
-_IN_SHADOW, _WITHOUT_LIGHTS = 0.3, 0.3
-# Shadow rays start so far (metres) above the surface, and end so far before the light.
-_ABOVE, _BEFORE = 1e-4, 1e-3
-_SPOT = int(mujoco.mjtLightType.mjLIGHT_SPOT)
-_DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-
-
-class _Shading:
-    """Colors of surfaces, by the formulas of MuJoCo Warp's renderer.
-
-    A light adds its diffuse color times the cosine between surface and light, and its specular color
-    times a power of the cosine between the surface and the direction halfway to the eye.
-    """
-
-    def __init__(self, model: mujoco.MjModel, kinds: Tensor, use_textures: bool) -> None:
-        """Take the lights and (if wanted) textures of a model, for geoms of types `kinds` (G,)."""
-        self._num_lights, self._headlight = model.nlight, model.vis.headlight
-        self._textures = Textures(model, torch.nn.functional.pad(kinds, (0, 1), value=-1))
-        self._use_textures = use_textures and model.ntex > 0 and model.nmat > 0
-
-    def shade(
-        self,
-        met: Surfaces,
-        geoms: Geoms,
-        pos: Tensor,
-        mat: Tensor,
-        read: ReadField,
-        shadow: Callable[[Tensor, Tensor, Tensor], Tensor] | None,
-    ) -> Tensor:
-        """Return the colors of the rays, (n, P, 3) uint8.
-
-        Args:
-            met: What the rays met.
-            geoms: The geoms that they can meet.
-            pos: Position of the camera, (n, 3). mat: Its orientation, (n, 3, 3).
-            read: Reads fields.
-            shadow: Whether something is in the way: origins (3, n, P), directions, distances (n, P)
-                to (n, P) bool. None for no shadows.
-        """
-        # One entry more, for rays that met nothing.
-        material = torch.nn.functional.pad(geoms.material, (0, 1), value=-1)
-        rgb = torch.nn.functional.pad(geoms.rgba.permute(2, 0, 1)[:3], (0, 1))
-        rgb = of_pixels(rgb, met.columns)
-        if self._use_textures:
-            self._textures.paint(rgb, met, geoms, material, read)
-        exponent = of_materials(read("mat_shininess"), material, _SHININESS) * _MAX_EXPONENT
-        reflected = of_materials(read("mat_specular"), material, _SPECULAR)
-        reflected = torch.where(exponent > 0.0, reflected, 0.0)
-        emission = of_materials(read("mat_emission"), material, 0.0)
-        brightness = torch.zeros_like(rgb)
-        if emission.any():
-            brightness += of_pixels(emission, met.columns)
-        ambient = torch.full((3,), 0.0 if self._num_lights else _WITHOUT_LIGHTS)
-        if self._headlight.active:
-            ambient = torch.tensor(self._headlight.ambient, dtype=torch.float32)
-        own = read("light_ambient") * (read("light_active") != 0)[..., None]
-        brightness += (ambient + own.sum(dim=1)).t()[..., None]
-        shines = bool(reflected.any())
-        if shines:
-            exponent, gloss = of_pixels(exponent, met.columns), torch.zeros_like(rgb)
-            facing = -_dot(met.normals, met.directions)
-        for diffuse, specular, direction, distance, strength, casts_shadow in self._lights(
-            met.points, pos, mat, read
-        ):
-            cosine = _dot(met.normals, direction).clamp_(min=0.0)
-            if shadow is not None and casts_shadow.any():
-                origins = met.points + _ABOVE * met.normals
-                hidden = shadow(origins, direction.expand_as(origins), distance - _BEFORE)
-                hidden &= casts_shadow & (cosine > 0.0)
-                strength = strength * torch.where(hidden, _IN_SHADOW, 1.0)
-            brightness.addcmul_(cosine * strength, diffuse)
-            if shines and specular.any():
-                # |L + V|^2 = 2 + 2 L.V, so that the direction halfway is never needed itself.
-                length = (2.0 - 2.0 * _dot(met.directions, direction)).clamp_(min=1e-12)
-                halfway = (cosine + facing).div_(length.sqrt_()).clamp_(0.0, 1.0)
-                halfway = halfway.pow_(exponent).masked_fill_(cosine <= 0.0, 0.0)
-                gloss.addcmul_(halfway.mul_(strength), specular)
-        rgb *= brightness
-        if shines:
-            rgb += gloss.mul_(of_pixels(reflected, met.columns))
-        missed = met.columns == geoms.pos.shape[1]
-        rgb.clamp_(0.0, 1.0).masked_fill_(missed, 0.0)
-        env, pixel = missed.nonzero(as_tuple=True)
-        if len(env):
-            directions = met.directions.expand_as(met.points)[:, env, pixel]
-            world = (mat[env] @ directions.t()[..., None]).squeeze(-1).t()
-            self._textures.paint_sky(rgb, missed, world)
-        return torch.stack(rgb.mul_(255.0).to(torch.uint8).unbind(), dim=-1)
-
-    def _lights(
-        self, points: Tensor, pos: Tensor, mat: Tensor, read: ReadField
-    ) -> Iterator[tuple[Tensor, ...]]:
-        """Yield what each light that shines somewhere is at the points (3, n, P).
-
-        Axes n and P may be 1. Yields:
-            Diffuse and specular color, (3, n, 1).
-            Unit vector to the light, (3, n, P), and distance (m), (n, P).
-            Part that arrives, (n, P).
-            Whether it casts shadows, (n, 1) bool.
-        """
-        endless, one = torch.full((1, 1), _ENDLESS), torch.ones(1, 1)
-        for i in range(self._num_lights):
-
-            def own(name: str, i: int = i) -> Tensor:
-                return read(f"light_{name}")[:, i, None]
-
-            active = own("active") != 0
-            diffuse = (own("diffuse").squeeze(1) * active).t()[..., None]
-            specular = (own("specular").squeeze(1) * active).t()[..., None]
-            if not (diffuse.any() or specular.any()):
-                continue
-            axis = (read("light_xdir")[:, i, None] @ mat).permute(2, 0, 1)
-            direction, distance, strength = -axis, endless, one
-            is_far = own("type") == _DIRECTIONAL
-            if not is_far.all():
-                to_light = ((read("light_xpos")[:, i] - pos)[:, None] @ mat).permute(2, 0, 1)
-                to_light = to_light - points
-                distance = _dot(to_light, to_light).sqrt_()
-                # MuJoCo raises for a ray without a direction, as one would be at the light itself.
-                to_light = torch.where(distance > 0.0, to_light / distance, direction)
-                constant, linear, squared = own("attenuation").permute(2, 0, 1)
-                strength = 1.0 / (constant + distance * (linear + distance * squared))
-                strength.masked_fill_(strength.isinf(), 0.0)
-                is_spot = own("type") == _SPOT
-                if is_spot.any():
-                    on_axis = -_dot(axis, to_light)
-                    spot = on_axis.clamp(min=0.0).pow(own("exponent"))
-                    spot.masked_fill_(on_axis < torch.deg2rad(own("cutoff")).cos(), 0.0)
-                    strength = strength * torch.where(is_spot, spot, 1.0)
-                direction = torch.where(is_far, direction, to_light)
-                distance = torch.where(is_far, endless, distance)
-                strength = torch.where(is_far, one, strength)
-            yield diffuse, specular, direction, distance, strength, own("castshadow") != 0
-        if self._headlight.active:
-            diffuse, specular = (
-                torch.tensor(color, dtype=torch.float32).view(3, 1, 1)
-                for color in (self._headlight.diffuse, self._headlight.specular)
-            )
-            # It shines along the optical axis.
-            direction = torch.tensor([0.0, 0.0, 1.0]).view(3, 1, 1)
-            yield diffuse, specular, direction, endless, one, torch.tensor(False)
-
-
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Return the products of vectors whose components come first."""
-    return torch.addcmul(a[0] * b[0], a[1], b[1]).addcmul_(a[2], b[2])

@@ -42,6 +42,7 @@ from mjlab.sim.randomization import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
 from mjlab.sim.warp.overflow import OverflowWatch
 from mjlab.sim.warp.rays import WarpRays
 from mjlab.sim.warp.render import WarpRenderer
+from mjlab.utils.errors import UnknownAttributeError
 from mjlab.utils.mujoco import flag_names
 from mjlab.utils.string import name_list
 
@@ -90,12 +91,6 @@ class UnsupportedByWarpError(EngineUnavailableError, NotImplementedError):
     """The model or an option needs something that MuJoCo Warp does not have."""
 
 
-def _be_quiet() -> None:
-    """Keep Warp's banner and its compile messages from users who did not ask for them."""
-    if os.environ.get("MJLAB_WARP_QUIET", "1").strip().lower() not in ("0", "false", "no"):
-        wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-
-
 class WarpEngine(Engine):
     """MuJoCo Warp on one CUDA device, or on the CPU.
 
@@ -115,11 +110,14 @@ class WarpEngine(Engine):
             UnsupportedByWarpError: the model needs what MuJoCo Warp does not have.
             EngineUnavailableError: there is no such device.
         """
-        refuse_unsupported(model)
-        _be_quiet()
+        check_supported(model)
+        # Keep Warp's banner and its compile messages from users who did not ask for them.
+        if os.environ.get("MJLAB_WARP_QUIET", "1").strip().lower() not in ("0", "false", "no"):
+            wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
         self.num_envs = num_envs
         self.device = torch.device(device)
         self.wp_device = _find_device(self.device)
+        self._on_cuda: bool = self.wp_device.is_cuda
         self.mj_model = model
         self._host = mujoco.MjData(model)
         mujoco.mj_forward(model, self._host)
@@ -192,10 +190,6 @@ class WarpEngine(Engine):
             self.wp_model.opt.graph_conditional = wp.is_conditional_graph_supported()
 
     # Order of work on the GPU.
-
-    @property
-    def _on_cuda(self) -> bool:
-        return self.wp_device.is_cuda
 
     @contextmanager
     def ordered(self) -> Generator[None]:
@@ -283,13 +277,13 @@ class WarpEngine(Engine):
         if name not in self._data_tensors:
             offered = offered_data_fields(self.wp_data)
             if name == "ncon" or name.startswith("efc"):
-                raise AttributeError(
+                raise UnknownAttributeError(
                     f"The warp engine does not offer MjData.{name}; read contacts by a contact "
                     "sensor, or those of all environments together from sim.data.nacon and "
                     "sim.data.contact."
                 )
             if name not in offered:
-                raise AttributeError(
+                raise UnknownAttributeError(
                     f"The warp engine has no per-environment MjData field {name!r}. Available: "
                     f"{name_list(sorted(offered), near=(name,))}."
                 )
@@ -557,7 +551,7 @@ class WarpEngine(Engine):
         return {name: as_torch(getattr(self.wp_data, name)) for name in names}
 
 
-def refuse_unsupported(model: mujoco.MjModel) -> None:
+def check_supported(model: mujoco.MjModel) -> None:
     """Raise if options of the model are unknown to MuJoCo Warp, naming each and what to change.
 
     Raises:

@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from mjlab.sim.engine import LENS_FIELDS, CameraView, Images, rendered_geoms
+from mjlab.utils.errors import WrongStateError
 
 if TYPE_CHECKING:
     from mjlab.sim.warp.engine import WarpEngine
@@ -56,7 +57,7 @@ class WarpRenderer:
         for key, scene in self._scenes.items():
             if key[0] == views and view in scene.views.values():
                 return scene.context
-        raise RuntimeError("The view has not been rendered yet; call Simulation.sense() first.")
+        raise WrongStateError("The view has not been rendered yet; call Simulation.sense() first.")
 
 
 class _Scene:

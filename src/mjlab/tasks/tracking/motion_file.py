@@ -26,6 +26,8 @@ from typing import Any
 
 import numpy as np
 
+from mjlab.utils.os import replacing
+
 _ARRAYS: dict[str, int | None] = {
     "joint_pos": None,
     "joint_vel": None,
@@ -86,8 +88,8 @@ def read_motion(path: str | Path) -> Motion:
     missing = [key for key in _ARRAYS if key not in content]
     if missing:
         raise MotionFileError(
-            f"The motion {path} lacks {missing}; it has {sorted(content)}. `python -m "
-            "mjlab.scripts.csv_to_npz` makes a motion from joint angles."
+            f"The motion {path} lacks {missing}; it has {sorted(content)}. "
+            "`mjlab csv-to-npz` makes a motion from joint angles."
         )
     arrays = {key: _checked_array(path, key, content[key], size) for key, size in _ARRAYS.items()}
     _check_sizes(path, arrays)
@@ -133,18 +135,13 @@ def write_motion(path: str | Path, motion: Motion) -> Path:
         if (names := getattr(motion, key))
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            for key, array in entries.items():
-                buffer = io.BytesIO()
-                np.lib.format.write_array(buffer, array, allow_pickle=False)
-                # A fixed date, because `np.savez` would write that of today.
-                info = zipfile.ZipInfo(f"{key}.npy")
-                archive.writestr(info, buffer.getvalue(), zipfile.ZIP_DEFLATED, 9)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for key, array in entries.items():
+            buffer = io.BytesIO()
+            np.lib.format.write_array(buffer, array, allow_pickle=False)
+            # A fixed date, because `np.savez` would write that of today.
+            info = zipfile.ZipInfo(f"{key}.npy")
+            archive.writestr(info, buffer.getvalue(), zipfile.ZIP_DEFLATED, 9)
     return path
 
 
@@ -189,7 +186,7 @@ def check_motion_fits(
         raise MotionFileError(
             f"The motion {path} has {motion.fps:g} frames per second, and the task is controlled "
             f"{1.0 / step_dt:g} times per second (every {step_dt:g} s), so that it would play at "
-            "the wrong speed. Resample it: `python -m mjlab.scripts.csv_to_npz --input-file "
+            "the wrong speed. Resample it: `mjlab csv-to-npz --input-file "
             f"{path} --output-fps {1.0 / step_dt:g} --output-file ...`."
         )
 

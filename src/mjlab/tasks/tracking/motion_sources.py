@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mjlab.tasks.tracking.motion_file import MotionFileError, motion_hash
-from mjlab.utils.os import own_folder
+from mjlab.utils.os import own_folder, replacing
 
 # MERGED mjlab.tasks.tracking.motion_sources: The motions that a run was trained on, kept in its folder: copies, where they came from, hashes.
 #
@@ -46,10 +46,9 @@ def record_motions(
         shutil.copyfile(path, folder / name)
         source = registry_name if registry_name is not None else str(path.resolve())
         entries.append({"file": name, "source": source, "sha256": motion_hash(folder / name)})
-    temporary = folder / f".{INDEX}.tmp"
-    temporary.write_text(json.dumps(entries, indent=2) + "\n")
     # Last, because its presence says that all the others are there.
-    temporary.replace(folder / INDEX)
+    with replacing(folder / INDEX) as file:
+        file.write((json.dumps(entries, indent=2) + "\n").encode())
     return [*(folder / entry["file"] for entry in entries), folder / INDEX]
 
 

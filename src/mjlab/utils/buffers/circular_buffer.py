@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
+from mjlab.utils.errors import WrongStateError, check_count
 from mjlab.utils.state import stateful
 
 BatchIds = Sequence[int] | torch.Tensor | slice
@@ -24,8 +25,7 @@ class CircularBuffer:
 
     def __init__(self, max_len: int, batch_size: int, device: str) -> None:
         """Make an empty buffer. Raises `ValueError` if `max_len` is less than 1."""
-        if max_len < 1:
-            raise ValueError(f"max_len is {max_len}; a buffer must hold at least 1 frame.")
+        check_count("max_len", max_len)
         self._max_len = max_len
         self._batch_size = batch_size
         self._device = device
@@ -113,7 +113,10 @@ class CircularBuffer:
             )
         self._pointer = (self._pointer + 1) % self._max_len
         if self._may_have_empty_rows:
-            self._fill_empty_rows(self._buffer, data)
+            # A mask, because finding the empty rows would make a GPU wait.
+            empty = (self._num_pushes == 0).view(1, -1, *(1,) * (data.dim() - 1))
+            torch.where(empty, data.to(self._buffer).unsqueeze(0), self._buffer, out=self._buffer)
+            self._may_have_empty_rows = False
         self._buffer[self._pointer] = data
         self._num_pushes += 1
 
@@ -136,15 +139,9 @@ class CircularBuffer:
         self._num_pushes[rows] = 0
         self._may_have_empty_rows = True
 
-    def _fill_empty_rows(self, ring: torch.Tensor, data: torch.Tensor) -> None:
-        # A mask, because finding the empty rows would make a GPU wait.
-        empty = (self._num_pushes == 0).view(1, -1, *(1,) * (ring.dim() - 2))
-        torch.where(empty, data.to(ring).unsqueeze(0), ring, out=ring)
-        self._may_have_empty_rows = False
-
     def _ring(self, purpose: str) -> torch.Tensor:
         if self._buffer is None:
-            raise RuntimeError(f"Cannot {purpose} a buffer nothing has been appended to.")
+            raise WrongStateError(f"Cannot {purpose} a buffer nothing has been appended to.")
         return self._buffer
 
     def _check_batch(self, data: torch.Tensor) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from mjlab.utils.buffers.circular_buffer import BatchIds, CircularBuffer
+from mjlab.utils.errors import check_count, check_in_range
 from mjlab.utils.state import stateful
 
 
@@ -60,7 +61,10 @@ class DelayBuffer:
 
         Raises `ValueError` for lags, a probability or a period out of range.
         """
-        _validate(min_lag, max_lag, hold_prob, update_period)
+        check_count("min_lag", min_lag, minimum=0)
+        check_count("max_lag", max_lag, minimum=min_lag)
+        check_in_range("hold_prob", hold_prob, 0.0, 1.0)
+        check_count("update_period", update_period, minimum=0)
         self._min_lag = min_lag
         self._max_lag = max_lag
         self._batch_size = batch_size
@@ -151,7 +155,9 @@ class DelayBuffer:
         if self._update_period > 0:
             change = (self._step_count + self._phase) % self._update_period == 0
         if self._hold_prob > 0:
-            moved = self._draw_uniform() >= self._hold_prob
+            size, device = self._num_draws, self._source_device()
+            draw = torch.rand(size, dtype=torch.float32, generator=self._generator, device=device)
+            moved = draw.to(self._device) >= self._hold_prob
             change = moved if change is None else change & moved
         self._step_count += 1
         if change is None:
@@ -176,25 +182,6 @@ class DelayBuffer:
             low, high, (self._num_draws,), generator=self._generator, device=self._source_device()
         ).to(self._device)
 
-    def _draw_uniform(self) -> torch.Tensor:
-        return torch.rand(
-            self._num_draws,
-            dtype=torch.float32,
-            generator=self._generator,
-            device=self._source_device(),
-        ).to(self._device)
-
     def _source_device(self) -> torch.device | str:
         # A generator only makes numbers on its own device.
         return self._device if self._generator is None else self._generator.device
-
-
-def _validate(min_lag: int, max_lag: int, hold_prob: float, update_period: int) -> None:
-    if min_lag < 0:
-        raise ValueError(f"min_lag is {min_lag}; it must be at least 0.")
-    if max_lag < min_lag:
-        raise ValueError(f"max_lag is {max_lag}; it must be at least min_lag, {min_lag}.")
-    if not 0.0 <= hold_prob <= 1.0:
-        raise ValueError(f"hold_prob is {hold_prob}; it must be from 0 to 1.")
-    if update_period < 0:
-        raise ValueError(f"update_period is {update_period}; it must be at least 0.")

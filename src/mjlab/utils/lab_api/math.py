@@ -1,7 +1,9 @@
 """Maths of rotations, poses and random samples, batched over leading axes.
 
 Quaternions are (w, x, y, z) with the Hamilton product; angles are in radians; rotation vectors are
-axis times angle.
+axis times angle. A pinhole camera looks along +z with x to the right and y down: with the intrinsic
+matrix K, pixel (u, v) at depth z is the point z K^-1 (u, v, 1). Pixels are counted from the upper left,
+u along a row.
 """
 
 from __future__ import annotations
@@ -13,62 +15,74 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 import torch
 
+from mjlab.utils.errors import check_count, check_one_of
 from mjlab.utils.torch import constant_tensor
 
-# MERGED mjlab.utils.lab_api.math: Scalars and vectors: ranges, angles, norms.
-
-
-def scale_transform(x: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
-    """Map [lower, upper] linearly to [-1, 1]."""
-    return 2.0 * (x - 0.5 * (lower + upper)) / (upper - lower)
-
-
-def unscale_transform(x: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
-    """Map [-1, 1] linearly to [lower, upper]."""
-    return 0.5 * x * (upper - lower) + 0.5 * (lower + upper)
-
-
-def saturate(x: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
-    """Limit `x` to [lower, upper], element by element."""
-    return torch.maximum(torch.minimum(x, upper), lower)
-
-
-def normalize(x: torch.Tensor, eps: float = 1e-9) -> torch.Tensor:
-    """Return the vectors on the last axis at unit length; those shorter than `eps` stay short."""
-    return x / torch.linalg.vector_norm(x, dim=-1, keepdim=True).clamp(min=eps)
-
-
-def wrap_to_pi(angles: torch.Tensor) -> torch.Tensor:
-    """Return the angles (rad) in [-pi, pi]: odd multiples of pi keep their sign."""
-    turned = torch.remainder(angles + torch.pi, 2.0 * torch.pi)
-    return torch.where((turned == 0) & (angles > 0), torch.pi, turned - torch.pi)
-
-
-def copysign(mag: float, other: torch.Tensor) -> torch.Tensor:
-    """Return numbers of size `mag` with the signs of `other`."""
-    return torch.copysign(torch.full_like(other, abs(mag)), other)
-
-
-def matrix_product(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """Return the products (..., i, k) of small matrices (..., i, j) and (..., j, k).
-
-    They are sums, because a GPU may round the operands of `@` to TF32: 8 mm at 10 m.
-    """
-    return (first.unsqueeze(-1) * second.unsqueeze(-3)).sum(dim=-2)
-
-
-def skew_symmetric_matrix(vec: torch.Tensor) -> torch.Tensor:
-    """Return S with S u = vec x u; (..., 3) gives (..., 3, 3)."""
-    x, y, z = vec.unbind(-1)
-    zero = torch.zeros_like(x)
-    rows = (zero, -z, y, z, zero, -x, -y, x, zero)
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
-
-
-# MERGED mjlab.utils.lab_api.math: Conversions between quaternions (w, x, y, z), matrices and Euler angles.
-
+__all__ = [
+    "apply_delta_pose",
+    "axis_angle_from_quat",
+    "combine_frame_transforms",
+    "compute_pose_error",
+    "convert_camera_frame_orientation_convention",
+    "convert_quat",
+    "copysign",
+    "create_rotation_matrix_from_view",
+    "default_orientation",
+    "euler_xyz_from_quat",
+    "generate_random_rotation",
+    "generate_random_transformation_matrix",
+    "generate_random_translation",
+    "interpolate_poses",
+    "interpolate_rotations",
+    "is_identity_pose",
+    "make_pose",
+    "matrix_from_euler",
+    "matrix_from_quat",
+    "matrix_product",
+    "normalize",
+    "orthogonalize_perspective_depth",
+    "pose_in_A_to_pose_in_B",
+    "pose_inv",
+    "project_points",
+    "quat_apply",
+    "quat_apply_inverse",
+    "quat_apply_yaw",
+    "quat_box_minus",
+    "quat_box_plus",
+    "quat_conjugate",
+    "quat_error_magnitude",
+    "quat_from_angle_axis",
+    "quat_from_euler_xyz",
+    "quat_from_matrix",
+    "quat_inv",
+    "quat_mul",
+    "quat_rotate",
+    "quat_rotate_inverse",
+    "quat_slerp",
+    "quat_unique",
+    "random_orientation",
+    "random_yaw_orientation",
+    "rigid_body_twist_transform",
+    "sample_cylinder",
+    "sample_gaussian",
+    "sample_log_uniform",
+    "sample_ranges",
+    "sample_triangle",
+    "sample_uniform",
+    "saturate",
+    "scale_transform",
+    "skew_symmetric_matrix",
+    "subtract_frame_transforms",
+    "transform_points",
+    "transform_poses_from_frame_A_to_frame_B",
+    "unmake_pose",
+    "unproject_depth",
+    "unscale_transform",
+    "wrap_to_pi",
+    "yaw_quat",
+]
 ArrayT = TypeVar("ArrayT", torch.Tensor, np.ndarray)
-
+Size = int | tuple[int, ...]
 # A camera's axes (columns) in those of the OpenGL convention: there it looks along -z with +y up.
 _IN_OPENGL = {
     "opengl": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
@@ -79,13 +93,199 @@ _IN_OPENGL = {
 }
 
 
+# Quaternions.
+
+
+def quat_mul(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
+    """Return q1 * q2: rotate by q2, then by q1. `ValueError` unless the shapes are equal."""
+    if q1.shape != q2.shape:
+        raise ValueError(
+            f"quat_mul got shapes {tuple(q1.shape)} and {tuple(q2.shape)}; they must be equal "
+            "(expand one of them)."
+        )
+    # Each component of q1 times all of q2: 16 operations, where the components of the product, one
+    # by one, take 29.
+    product = q1[..., :1] * q2
+    w, x, y, z = (product[..., k] for k in range(4))
+    xw, xx, xy, xz = (q1[..., 1:2] * q2).unbind(-1)
+    w -= xx
+    x += xw
+    y -= xz
+    z += xy
+    yw, yx, yy, yz = (q1[..., 2:3] * q2).unbind(-1)
+    w -= yy
+    x += yz
+    y += yw
+    z -= yx
+    zw, zx, zy, zz = (q1[..., 3:] * q2).unbind(-1)
+    w -= zz
+    x -= zy
+    y += zx
+    z += zw
+    return product.contiguous()
+
+
+def quat_conjugate(q: torch.Tensor) -> torch.Tensor:
+    """Return (w, -x, -y, -z)."""
+    conjugate = -q
+    conjugate[..., 0] = q[..., 0]
+    return conjugate
+
+
+def quat_inv(q: torch.Tensor, eps: float = 1e-9) -> torch.Tensor:
+    """Return the inverse of quaternions of any norm: conjugate / max(norm^2, eps)."""
+    return quat_conjugate(q) / q.square().sum(dim=-1, keepdim=True).clamp(min=eps)
+
+
+def quat_unique(q: torch.Tensor) -> torch.Tensor:
+    """Return the quaternion of the same rotation with w >= 0."""
+    return torch.where(q[..., :1] < 0, -q, q)
+
+
+def quat_apply(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
+    """Rotate vectors: R(q) v.
+
+    Args:
+        quat: Unit quaternions, one for each vector or one for all; (..., 4).
+        vec: (..., 3).
+
+    Returns a tensor of the shape of `vec`. Raises `ValueError` if sizes do not fit.
+    """
+    return _rotate(_fit_to(quat, vec), vec, sign=1.0)
+
+
+def quat_apply_inverse(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
+    """Rotate vectors back: R(q)' v. Arguments and errors are those of `quat_apply`."""
+    return _rotate(_fit_to(quat, vec), vec, sign=-1.0)
+
+
+quat_rotate = quat_apply
+quat_rotate_inverse = quat_apply_inverse
+
+
+def quat_apply_yaw(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
+    """Rotate vectors by the yaw of the quaternions only."""
+    return quat_apply(yaw_quat(quat), vec)
+
+
+def yaw_quat(quat: torch.Tensor) -> torch.Tensor:
+    """Return the rotation about z by the yaw angle of the quaternions; (..., 4)."""
+    w, x, y, z = quat.unbind(-1)
+    half = 0.5 * torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    zero = torch.zeros_like(half)
+    return torch.stack((torch.cos(half), zero, zero, torch.sin(half)), dim=-1)
+
+
+def _rotate(quat: torch.Tensor, vec: torch.Tensor, sign: float) -> torch.Tensor:
+    """Return v + 2 (s w c + xyz x c) with c = xyz x v; `sign` s is -1 for the inverse rotation."""
+    w, xyz = quat[..., :1], quat[..., 1:]
+    cross = torch.linalg.cross(xyz, vec)
+    change = torch.linalg.cross(xyz, cross).addcmul_(w, cross, value=sign)
+    return torch.add(vec, change, alpha=2.0)
+
+
+def _fit_to(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
+    """Return `quat` in a shape whose leading sizes broadcast to those of `vec`."""
+    if quat.shape[-1] == 4 and vec.shape[-1] == 3:
+        if quat.shape[:-1] == vec.shape[:-1]:
+            return quat
+        num_quats = quat.numel() // 4
+        if num_quats == 1:
+            return quat.reshape(*(1,) * (vec.dim() - 1), 4)
+        if num_quats == vec.numel() // 3:
+            return quat.reshape(*vec.shape[:-1], 4)
+        if quat.dim() == vec.dim() and all(
+            size in (1, wanted) for size, wanted in zip(quat.shape[:-1], vec.shape, strict=False)
+        ):
+            return quat
+    raise ValueError(
+        f"Cannot rotate vectors of shape {tuple(vec.shape)} by quaternions of shape "
+        f"{tuple(quat.shape)}; expected (..., 3) and (..., 4), one quaternion for each vector or "
+        "one for all."
+    )
+
+
+def quat_from_angle_axis(angle: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:
+    """Return the rotation by `angle` (...) rad about `axis` (..., 3), normalized here."""
+    half = 0.5 * angle.unsqueeze(-1)
+    direction = normalize(axis)
+    vector = direction * torch.sin(half)
+    # Normalized again for the sake of axes of length zero.
+    return normalize(torch.cat((torch.cos(half).expand_as(vector[..., :1]), vector), dim=-1))
+
+
+def axis_angle_from_quat(quat: torch.Tensor, eps: float = 1.0e-6) -> torch.Tensor:
+    """Return the rotation vector, axis times angle in [0, pi]; (..., 3).
+
+    Half angles with a sine of at most `eps` use the series of angle / sin(angle / 2).
+    """
+    quat = quat_unique(quat)
+    real, vector = quat[..., :1], quat[..., 1:]
+    sine = torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
+    angle = 2.0 * torch.atan2(sine, real)
+    is_small = sine <= eps
+    # A divisor of 1 where the series is used keeps gradients finite.
+    ratio = angle / torch.where(is_small, 1.0, sine)
+    return vector * torch.where(is_small, 2.0 + angle.square() / 12.0, ratio)
+
+
+def quat_box_minus(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
+    """Return log(q1 * conj(q2)): the rotation vector, in world axes, that takes q2 to q1."""
+    return axis_angle_from_quat(quat_mul(q1, quat_conjugate(q2)))
+
+
+def quat_box_plus(q: torch.Tensor, delta: torch.Tensor, eps: float = 1.0e-6) -> torch.Tensor:
+    """Return exp(delta) * q: q rotated by the rotation vector `delta` (..., 3) in world axes.
+
+    Rotations by an angle of at most `eps` leave q unchanged.
+    """
+    angle = torch.linalg.vector_norm(delta, dim=-1)
+    turned = quat_mul(quat_from_angle_axis(angle, delta), q)
+    return torch.where(angle.unsqueeze(-1) > eps, turned, q)
+
+
+def quat_error_magnitude(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
+    """Return the angle between two orientations, unit quaternions, in [0, pi]; (...)."""
+    # Chords of the unit sphere are cheap, and precise for small angles: |q1 - q2| = 2 sin(angle / 4)
+    # and |q1 + q2| = 2 cos(angle / 4), or the other way round where one of them is to be negated.
+    away = torch.linalg.vector_norm(q1 - q2, dim=-1)
+    along = torch.linalg.vector_norm(q1 + q2, dim=-1)
+    return 4.0 * torch.atan2(torch.minimum(away, along), torch.maximum(away, along))
+
+
+def quat_slerp(q1: torch.Tensor, q2: torch.Tensor, tau: float) -> torch.Tensor:
+    """Interpolate the short way between two quaternions, (4,) each; tau 0 gives q1, 1 gives q2.
+
+    (Nearly) equal rotations give q1. The arguments are not changed. Raises `ValueError` for
+    other shapes.
+    """
+    if q1.shape != (4,) or q2.shape != (4,):
+        raise ValueError(
+            f"quat_slerp takes two quaternions of shape (4,), got {tuple(q1.shape)} and "
+            f"{tuple(q2.shape)}."
+        )
+    if tau == 0.0:
+        return q1.clone()
+    if tau == 1.0:
+        return q2.clone()
+    target = torch.where(torch.dot(q1, q2) < 0, -q2, q2)
+    # Precise for small angles too, where the arc cosine is not.
+    angle = 2.0 * torch.atan2((q1 - target).norm(), (q1 + target).norm())
+    sine = torch.sin(angle)
+    if sine <= 4.0 * torch.finfo(q1.dtype).eps:
+        return q1.clone()
+    return (torch.sin((1.0 - tau) * angle) * q1 + torch.sin(tau * angle) * target) / sine
+
+
+# Conversions between quaternions, matrices and Euler angles.
+
+
 def convert_quat(quat: ArrayT, to: Literal["xyzw", "wxyz"] = "xyzw") -> ArrayT:
     """Reorder quaternions (..., 4) from (w, x, y, z) to (x, y, z, w), or back.
 
     Raises `ValueError` for another target or last size.
     """
-    if to not in ("xyzw", "wxyz"):
-        raise ValueError(f"to={to!r}; it must be 'xyzw' or 'wxyz'.")
+    check_one_of("to", to, ("xyzw", "wxyz"))
     if quat.shape[-1] != 4:
         raise ValueError(f"Expected quaternions of shape (..., 4), got {tuple(quat.shape)}.")
     shift = -1 if to == "xyzw" else 1
@@ -209,9 +409,8 @@ def convert_camera_frame_orientation_convention(
     "opengl" looks along -z with +y up, "ros" along +z with -y up, "world" along +x with +z up.
     Raises `ValueError` for another convention.
     """
-    for name in (origin, target):
-        if name not in _IN_OPENGL:
-            raise ValueError(f"Unknown convention {name!r}; use one of {list(_IN_OPENGL)}.")
+    check_one_of("origin", origin, _IN_OPENGL)
+    check_one_of("target", target, _IN_OPENGL)
     if origin == target:
         return orientation.clone()
     # Rows of the table are rows of matrices that take coordinates of a convention to OpenGL's.
@@ -238,8 +437,7 @@ def create_rotation_matrix_from_view(
     A camera that looks straight up or down takes the world's x axis as its right. Raises
     `ValueError` for another `up_axis`.
     """
-    if up_axis not in ("Y", "Z"):
-        raise ValueError(f"up_axis is {up_axis!r}; it must be 'Y' or 'Z'.")
+    check_one_of("up_axis", up_axis, ("Y", "Z"))
     backward = normalize((eyes - targets).to(device))
     up = torch.zeros_like(backward)
     up[..., "XYZ".index(up_axis)] = 1.0
@@ -249,191 +447,7 @@ def create_rotation_matrix_from_view(
     return torch.stack((right, torch.linalg.cross(backward, right), backward), dim=-1)
 
 
-# MERGED mjlab.utils.lab_api.math: Quaternions (w, x, y, z) with the Hamilton product, on the last axis of a tensor.
-
-
-def quat_mul(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
-    """Return q1 * q2: rotate by q2, then by q1. `ValueError` unless the shapes are equal."""
-    if q1.shape != q2.shape:
-        raise ValueError(
-            f"quat_mul got shapes {tuple(q1.shape)} and {tuple(q2.shape)}; they must be equal "
-            "(expand one of them)."
-        )
-    # Each component of q1 times all of q2: 16 operations, where the components of the product, one
-    # by one, take 29.
-    product = q1[..., :1] * q2
-    w, x, y, z = (product[..., k] for k in range(4))
-    xw, xx, xy, xz = (q1[..., 1:2] * q2).unbind(-1)
-    w -= xx
-    x += xw
-    y -= xz
-    z += xy
-    yw, yx, yy, yz = (q1[..., 2:3] * q2).unbind(-1)
-    w -= yy
-    x += yz
-    y += yw
-    z -= yx
-    zw, zx, zy, zz = (q1[..., 3:] * q2).unbind(-1)
-    w -= zz
-    x -= zy
-    y += zx
-    z += zw
-    return product.contiguous()
-
-
-def quat_conjugate(q: torch.Tensor) -> torch.Tensor:
-    """Return (w, -x, -y, -z)."""
-    conjugate = -q
-    conjugate[..., 0] = q[..., 0]
-    return conjugate
-
-
-def quat_inv(q: torch.Tensor, eps: float = 1e-9) -> torch.Tensor:
-    """Return the inverse of quaternions of any norm: conjugate / max(norm^2, eps)."""
-    return quat_conjugate(q) / q.square().sum(dim=-1, keepdim=True).clamp(min=eps)
-
-
-def quat_unique(q: torch.Tensor) -> torch.Tensor:
-    """Return the quaternion of the same rotation with w >= 0."""
-    return torch.where(q[..., :1] < 0, -q, q)
-
-
-def quat_apply(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
-    """Rotate vectors: R(q) v.
-
-    Args:
-        quat: Unit quaternions, one for each vector or one for all; (..., 4).
-        vec: (..., 3).
-
-    Returns a tensor of the shape of `vec`. Raises `ValueError` if sizes do not fit.
-    """
-    return _rotate(_fit_to(quat, vec), vec, sign=1.0)
-
-
-def quat_apply_inverse(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
-    """Rotate vectors back: R(q)' v. Arguments and errors are those of `quat_apply`."""
-    return _rotate(_fit_to(quat, vec), vec, sign=-1.0)
-
-
-quat_rotate = quat_apply
-quat_rotate_inverse = quat_apply_inverse
-
-
-def quat_apply_yaw(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
-    """Rotate vectors by the yaw of the quaternions only."""
-    return quat_apply(yaw_quat(quat), vec)
-
-
-def yaw_quat(quat: torch.Tensor) -> torch.Tensor:
-    """Return the rotation about z by the yaw angle of the quaternions; (..., 4)."""
-    w, x, y, z = quat.unbind(-1)
-    half = 0.5 * torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    zero = torch.zeros_like(half)
-    return torch.stack((torch.cos(half), zero, zero, torch.sin(half)), dim=-1)
-
-
-def quat_from_angle_axis(angle: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:
-    """Return the rotation by `angle` (...) rad about `axis` (..., 3), normalized here."""
-    half = 0.5 * angle.unsqueeze(-1)
-    direction = normalize(axis)
-    vector = direction * torch.sin(half)
-    # Normalized again for the sake of axes of length zero.
-    return normalize(torch.cat((torch.cos(half).expand_as(vector[..., :1]), vector), dim=-1))
-
-
-def axis_angle_from_quat(quat: torch.Tensor, eps: float = 1.0e-6) -> torch.Tensor:
-    """Return the rotation vector, axis times angle in [0, pi]; (..., 3).
-
-    Half angles with a sine of at most `eps` use the series of angle / sin(angle / 2).
-    """
-    quat = quat_unique(quat)
-    real, vector = quat[..., :1], quat[..., 1:]
-    sine = torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
-    angle = 2.0 * torch.atan2(sine, real)
-    is_small = sine <= eps
-    # A divisor of 1 where the series is used keeps gradients finite.
-    ratio = angle / torch.where(is_small, 1.0, sine)
-    return vector * torch.where(is_small, 2.0 + angle.square() / 12.0, ratio)
-
-
-def quat_box_minus(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
-    """Return log(q1 * conj(q2)): the rotation vector, in world axes, that takes q2 to q1."""
-    return axis_angle_from_quat(quat_mul(q1, quat_conjugate(q2)))
-
-
-def quat_box_plus(q: torch.Tensor, delta: torch.Tensor, eps: float = 1.0e-6) -> torch.Tensor:
-    """Return exp(delta) * q: q rotated by the rotation vector `delta` (..., 3) in world axes.
-
-    Rotations by an angle of at most `eps` leave q unchanged.
-    """
-    angle = torch.linalg.vector_norm(delta, dim=-1)
-    turned = quat_mul(quat_from_angle_axis(angle, delta), q)
-    return torch.where(angle.unsqueeze(-1) > eps, turned, q)
-
-
-def quat_error_magnitude(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
-    """Return the angle between two orientations, unit quaternions, in [0, pi]; (...)."""
-    # Chords of the unit sphere are cheap, and precise for small angles: |q1 - q2| = 2 sin(angle / 4)
-    # and |q1 + q2| = 2 cos(angle / 4), or the other way round where one of them is to be negated.
-    away = torch.linalg.vector_norm(q1 - q2, dim=-1)
-    along = torch.linalg.vector_norm(q1 + q2, dim=-1)
-    return 4.0 * torch.atan2(torch.minimum(away, along), torch.maximum(away, along))
-
-
-def quat_slerp(q1: torch.Tensor, q2: torch.Tensor, tau: float) -> torch.Tensor:
-    """Interpolate the short way between two quaternions, (4,) each; tau 0 gives q1, 1 gives q2.
-
-    (Nearly) equal rotations give q1. The arguments are not changed. Raises `ValueError` for
-    other shapes.
-    """
-    if q1.shape != (4,) or q2.shape != (4,):
-        raise ValueError(
-            f"quat_slerp takes two quaternions of shape (4,), got {tuple(q1.shape)} and "
-            f"{tuple(q2.shape)}."
-        )
-    if tau == 0.0:
-        return q1.clone()
-    if tau == 1.0:
-        return q2.clone()
-    target = torch.where(torch.dot(q1, q2) < 0, -q2, q2)
-    # Precise for small angles too, where the arc cosine is not.
-    angle = 2.0 * torch.atan2((q1 - target).norm(), (q1 + target).norm())
-    sine = torch.sin(angle)
-    if sine <= 4.0 * torch.finfo(q1.dtype).eps:
-        return q1.clone()
-    return (torch.sin((1.0 - tau) * angle) * q1 + torch.sin(tau * angle) * target) / sine
-
-
-def _rotate(quat: torch.Tensor, vec: torch.Tensor, sign: float) -> torch.Tensor:
-    """Return v + 2 (s w c + xyz x c) with c = xyz x v; `sign` s is -1 for the inverse rotation."""
-    w, xyz = quat[..., :1], quat[..., 1:]
-    cross = torch.linalg.cross(xyz, vec)
-    change = torch.linalg.cross(xyz, cross).addcmul_(w, cross, value=sign)
-    return torch.add(vec, change, alpha=2.0)
-
-
-def _fit_to(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
-    """Return `quat` in a shape whose leading sizes broadcast to those of `vec`."""
-    if quat.shape[-1] == 4 and vec.shape[-1] == 3:
-        if quat.shape[:-1] == vec.shape[:-1]:
-            return quat
-        num_quats = quat.numel() // 4
-        if num_quats == 1:
-            return quat.reshape(*(1,) * (vec.dim() - 1), 4)
-        if num_quats == vec.numel() // 3:
-            return quat.reshape(*vec.shape[:-1], 4)
-        if quat.dim() == vec.dim() and all(
-            size in (1, wanted) for size, wanted in zip(quat.shape[:-1], vec.shape, strict=False)
-        ):
-            return quat
-    raise ValueError(
-        f"Cannot rotate vectors of shape {tuple(vec.shape)} by quaternions of shape "
-        f"{tuple(quat.shape)}; expected (..., 3) and (..., 4), one quaternion for each vector or "
-        "one for all."
-    )
-
-
-# MERGED mjlab.utils.lab_api.math: Poses as position (..., 3) and orientation (..., 4): combining, comparing, transforming.
+# Poses as position (..., 3) and orientation (..., 4).
 
 
 def combine_frame_transforms(
@@ -472,10 +486,7 @@ def compute_pose_error(
     The rotation is in world axes, as a rotation vector (..., 3) or a quaternion ("quat"). Raises
     `ValueError` for another `rot_error_type`.
     """
-    if rot_error_type not in ("quat", "axis_angle"):
-        raise ValueError(
-            f"rot_error_type is {rot_error_type!r}; it must be 'quat' or 'axis_angle'."
-        )
+    check_one_of("rot_error_type", rot_error_type, ("quat", "axis_angle"))
     rotation = quat_mul(q02, quat_inv(q01))
     if rot_error_type == "axis_angle":
         rotation = axis_angle_from_quat(rotation)
@@ -548,7 +559,7 @@ def is_identity_pose(pos: torch.Tensor, rot: torch.Tensor) -> bool:
     return no_shift and torch.allclose(rot * sign, identity)
 
 
-# MERGED mjlab.utils.lab_api.math: Poses as homogeneous matrices (..., 4, 4): making, inverting, interpolating.
+# Poses as homogeneous matrices (..., 4, 4).
 
 
 def make_pose(pos: torch.Tensor, rot: torch.Tensor) -> torch.Tensor:
@@ -611,8 +622,7 @@ def interpolate_rotations(
 
     Raises `ValueError` for fewer than one step.
     """
-    if num_steps < 1:
-        raise ValueError(f"num_steps is {num_steps}; it must be at least 1.")
+    check_count("num_steps", num_steps)
     fractions = [step / num_steps for step in range(num_steps)]
     if axis_angle:
         vector = axis_angle_from_quat(quat_from_matrix(matrix_product(R2, R1.transpose(-1, -2))))
@@ -679,9 +689,57 @@ def generate_random_transformation_matrix(
     )
 
 
-# MERGED mjlab.utils.lab_api.math: Random numbers, points and orientations, drawn on the device asked for.
+# Scalars and vectors.
 
-Size = int | tuple[int, ...]
+
+def scale_transform(x: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
+    """Map [lower, upper] linearly to [-1, 1]."""
+    return 2.0 * (x - 0.5 * (lower + upper)) / (upper - lower)
+
+
+def unscale_transform(x: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
+    """Map [-1, 1] linearly to [lower, upper]."""
+    return 0.5 * x * (upper - lower) + 0.5 * (lower + upper)
+
+
+def saturate(x: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
+    """Limit `x` to [lower, upper], element by element."""
+    return torch.maximum(torch.minimum(x, upper), lower)
+
+
+def normalize(x: torch.Tensor, eps: float = 1e-9) -> torch.Tensor:
+    """Return the vectors on the last axis at unit length; those shorter than `eps` stay short."""
+    return x / torch.linalg.vector_norm(x, dim=-1, keepdim=True).clamp(min=eps)
+
+
+def wrap_to_pi(angles: torch.Tensor) -> torch.Tensor:
+    """Return the angles (rad) in [-pi, pi]: odd multiples of pi keep their sign."""
+    turned = torch.remainder(angles + torch.pi, 2.0 * torch.pi)
+    return torch.where((turned == 0) & (angles > 0), torch.pi, turned - torch.pi)
+
+
+def copysign(mag: float, other: torch.Tensor) -> torch.Tensor:
+    """Return numbers of size `mag` with the signs of `other`."""
+    return torch.copysign(torch.full_like(other, abs(mag)), other)
+
+
+def matrix_product(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    """Return the products (..., i, k) of small matrices (..., i, j) and (..., j, k).
+
+    They are sums, because a GPU may round the operands of `@` to TF32: 8 mm at 10 m.
+    """
+    return (first.unsqueeze(-1) * second.unsqueeze(-3)).sum(dim=-2)
+
+
+def skew_symmetric_matrix(vec: torch.Tensor) -> torch.Tensor:
+    """Return S with S u = vec x u; (..., 3) gives (..., 3, 3)."""
+    x, y, z = vec.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = (zero, -z, y, z, zero, -x, -y, x, zero)
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+# Samples.
 
 
 def sample_uniform(
@@ -761,10 +819,7 @@ def _shape(size: Size) -> tuple[int, ...]:
     return (size,) if isinstance(size, int) else tuple(size)
 
 
-# MERGED mjlab.utils.lab_api.math: Pinhole cameras: pixels and depths to points in the camera's frame, and back.
-#
-# The camera looks along +z with x to the right and y down. With the intrinsic matrix K, pixel (u, v)
-# at depth z is the point z K^-1 (u, v, 1). Pixels are counted from the upper left, u along a row.
+# Pinhole cameras.
 
 
 def project_points(points: torch.Tensor, intrinsics: torch.Tensor) -> torch.Tensor:
@@ -852,68 +907,3 @@ def _rays(image: torch.Tensor, intrinsics: torch.Tensor) -> torch.Tensor:
     y = (v - k[..., 1, 2, :, :]) / k[..., 1, 1, :, :]
     x = (u - k[..., 0, 2, :, :] - k[..., 0, 1, :, :] * y) / k[..., 0, 0, :, :]
     return torch.stack((x, y, torch.ones_like(x)), dim=-1)
-
-
-__all__ = [
-    "apply_delta_pose",
-    "axis_angle_from_quat",
-    "combine_frame_transforms",
-    "compute_pose_error",
-    "convert_camera_frame_orientation_convention",
-    "convert_quat",
-    "copysign",
-    "create_rotation_matrix_from_view",
-    "default_orientation",
-    "euler_xyz_from_quat",
-    "generate_random_rotation",
-    "generate_random_transformation_matrix",
-    "generate_random_translation",
-    "interpolate_poses",
-    "interpolate_rotations",
-    "is_identity_pose",
-    "make_pose",
-    "matrix_from_euler",
-    "matrix_from_quat",
-    "matrix_product",
-    "normalize",
-    "orthogonalize_perspective_depth",
-    "pose_in_A_to_pose_in_B",
-    "pose_inv",
-    "project_points",
-    "quat_apply",
-    "quat_apply_inverse",
-    "quat_apply_yaw",
-    "quat_box_minus",
-    "quat_box_plus",
-    "quat_conjugate",
-    "quat_error_magnitude",
-    "quat_from_angle_axis",
-    "quat_from_euler_xyz",
-    "quat_from_matrix",
-    "quat_inv",
-    "quat_mul",
-    "quat_rotate",
-    "quat_rotate_inverse",
-    "quat_slerp",
-    "quat_unique",
-    "random_orientation",
-    "random_yaw_orientation",
-    "rigid_body_twist_transform",
-    "sample_cylinder",
-    "sample_gaussian",
-    "sample_log_uniform",
-    "sample_ranges",
-    "sample_triangle",
-    "sample_uniform",
-    "saturate",
-    "scale_transform",
-    "skew_symmetric_matrix",
-    "subtract_frame_transforms",
-    "transform_points",
-    "transform_poses_from_frame_A_to_frame_B",
-    "unmake_pose",
-    "unproject_depth",
-    "unscale_transform",
-    "wrap_to_pi",
-    "yaw_quat",
-]

@@ -13,6 +13,7 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from mjlab.utils.errors import WrongTypeError, check_one_of
 from mjlab.utils.string import compile_pattern, qualified_name
 
 
@@ -49,7 +50,7 @@ def resolve_matching_names_values(
     `TypeError` if `data` is not a dict, and `ValueError` as there.
     """
     if not isinstance(data, dict):
-        raise TypeError(
+        raise WrongTypeError(
             f"Expected a dict of regular expression to value, got {type(data).__name__}: {data!r}."
         )
     indices, names = resolve_matching_names(list(data), list_of_strings, preserve_order)
@@ -90,8 +91,7 @@ def to_camel_case(snake_str: str, to: str = "cC") -> str:
 
     Raises `ValueError` for another `to`.
     """
-    if to not in ("cC", "CC"):
-        raise ValueError(f"to={to!r}; it must be 'cC' (camelCase) or 'CC' (CamelCase).")
+    check_one_of("to", to, ("cC", "CC"))
     first, *rest = snake_str.split("_")
     head = first if to == "cC" else first[:1].upper() + first[1:]
     return head + "".join(word[:1].upper() + word[1:] for word in rest)

@@ -1,4 +1,7 @@
-"""Kinds of noise, as configs that apply themselves, and configs of noise models."""
+"""Noise on observations: independent draws, and models that keep state between calls.
+
+Independent draws are configs that apply themselves; a `NoiseModelCfg` has one model built from it.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,8 @@ from typing import Any, ClassVar, Literal
 
 import torch
 
-from mjlab.utils.noise.noise_model import NoiseModel, NoiseModelWithAdditiveBias
+from mjlab.utils.errors import check_one_of
+from mjlab.utils.state import stateful
 from mjlab.utils.torch import constant_tensor
 
 NoiseParam = float | tuple[float, ...]
@@ -41,11 +45,7 @@ class NoiseCfg(ABC):
         return noise
 
     def _check_operation(self) -> None:
-        if self.operation not in _OPERATIONS:
-            raise ValueError(
-                f"{type(self).__name__}.operation is {self.operation!r}; "
-                f"it must be one of {list(_OPERATIONS)}."
-            )
+        check_one_of(f"{type(self).__name__}.operation", self.operation, _OPERATIONS)
 
 
 @dataclass
@@ -105,6 +105,26 @@ class GaussianNoiseCfg(NoiseCfg):
         return self._combine(data, noise.add_(_param(self.mean, data)))
 
 
+@stateful
+class NoiseModel:
+    """Applies the noise of its config; subclasses keep state for each environment."""
+
+    def __init__(self, noise_model_cfg: NoiseModelCfg, num_envs: int, device: str) -> None:
+        """Make the model. Raises `ValueError` if the config has no noise."""
+        if noise_model_cfg.noise_cfg is None:
+            raise ValueError(f"{type(noise_model_cfg).__name__}.noise_cfg is None; set a NoiseCfg.")
+        self._noise_model_cfg = noise_model_cfg
+        self._num_envs = num_envs
+        self._device = device
+
+    def __call__(self, data: torch.Tensor) -> torch.Tensor:
+        """Return `data`, (num_envs, ...), with noise."""
+        return self._noise_model_cfg.noise_cfg.apply(data)
+
+    def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
+        """Start the given environments (None: all) anew."""
+
+
 @dataclass(kw_only=True)
 class NoiseModelCfg:
     """Config of a noise model, of which one is made for each observation term.
@@ -122,6 +142,52 @@ class NoiseModelCfg:
         super().__init_subclass__(**kwargs)
         if class_type is not None:
             cls.class_type = class_type
+
+
+class NoiseModelWithAdditiveBias(NoiseModel):
+    """Noise plus a bias, drawn for each environment when it is reset."""
+
+    _noise_model_cfg: NoiseModelWithAdditiveBiasCfg
+
+    def __init__(
+        self,
+        noise_model_cfg: NoiseModelWithAdditiveBiasCfg,
+        num_envs: int,
+        device: str,
+    ) -> None:
+        """Make the model. Raises `ValueError` if the noise or the bias is missing."""
+        super().__init__(noise_model_cfg, num_envs, device)
+        if noise_model_cfg.bias_noise_cfg is None:
+            raise ValueError(
+                f"{type(noise_model_cfg).__name__}.bias_noise_cfg is None; set a NoiseCfg."
+            )
+        self._bias_noise_cfg = noise_model_cfg.bias_noise_cfg
+        # One bias an environment; one a component once the first data shows how many there are.
+        self._bias = torch.zeros(num_envs, 1, dtype=torch.float32, device=device)
+        self._waits_for_components = noise_model_cfg.sample_bias_per_component
+
+    def __call__(self, data: torch.Tensor) -> torch.Tensor:
+        """Return `data`, (num_envs, ..., components), with noise and bias."""
+        if self._waits_for_components:
+            self._waits_for_components = False
+            # Data that comes first under `inference_mode` must not forbid later resets without it.
+            with torch.inference_mode(False):
+                self._bias = torch.zeros(
+                    self._num_envs, data.shape[-1], dtype=self._bias.dtype, device=self._device
+                )
+            self.reset()
+        bias = self._bias
+        if data.dim() > 2:
+            bias = bias.view(self._num_envs, *(1,) * (data.dim() - 2), bias.shape[-1])
+        return super().__call__(data) + bias
+
+    def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
+        """Draw a new bias for the given environments (None: all)."""
+        if self._waits_for_components:
+            return
+        ids = slice(None) if env_ids is None else env_ids
+        # Applied to zeros: a bias drawn on top of the old one would wander from reset to reset.
+        self._bias[ids] = self._bias_noise_cfg.apply(torch.zeros_like(self._bias[ids]))
 
 
 @dataclass(kw_only=True)

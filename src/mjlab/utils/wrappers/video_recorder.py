@@ -1,4 +1,4 @@
-"""Public path of `VideoRecorder`, whose home is `mjlab.utils.wrappers.video_recorder`."""
+"""Videos of an environment while something else steps it, each file written whole or not at all."""
 
 from __future__ import annotations
 
@@ -21,13 +21,203 @@ if TYPE_CHECKING:
     import torch
 
 
-# MERGED mjlab.utils.wrappers.video_recorder: Writing one video file, whole or not at all.
-
+log = logging.getLogger(__name__)
+_DEFAULT_FPS = 30.0
 _CODECS = {
     ".mp4": "-an -c:v libx264 -pix_fmt yuv420p -crf 20 -movflags +faststart",
     # One palette for the whole clip keeps colours from flickering.
     ".gif": "-an -vf split[a][b];[a]palettegen[p];[b][p]paletteuse",
 }
+
+
+class VideoRecorder(ManagerBasedRlEnv):
+    """Wraps an environment: steps it, and writes clips of what it renders.
+
+    It stands in for the environment everywhere: every attribute that is not the recorder's own is
+    read from, and written to, the environment.
+
+    Before each step the triggers are asked, and a clip starts if one of them says so and none is
+    being recorded; the frame is taken after the step. A clip ends after `video_length` frames, or
+    at the end of environment 0's episode where that is None, and whenever stepping fails or the
+    recorder is closed: what was recorded is never lost. Where this machine cannot render, that is
+    logged once and stepping goes on (`unavailable_reason`).
+    """
+
+    env: ManagerBasedRlEnv
+    video_folder: Path
+    written: list[Path]
+    unavailable_reason: str | None
+    _episode_trigger: Callable[[int], bool] | None
+    _step_trigger: Callable[[int], bool] | None
+    _video_length: int | None
+    _name_prefix: str
+    _disable_logger: bool
+    _clip: ClipWriter | None
+    _step_count: int
+    _episode_count: int
+    _episode_steps: int
+    _asked_episode: int
+
+    def __init__(
+        self,
+        env: ManagerBasedRlEnv,
+        video_folder: str | Path,
+        episode_trigger: Callable[[int], bool] | None = None,
+        step_trigger: Callable[[int], bool] | None = None,
+        video_length: int | None = None,
+        name_prefix: str = "rl-video",
+        disable_logger: bool = False,
+    ):
+        """Wrap `env`.
+
+        Args:
+            env: Environment made with `render_mode="rgb_array"`.
+            video_folder: Where `<prefix>-step-<n>.mp4` and `<prefix>-episode-<n>.mp4` go.
+            episode_trigger: Asked once an episode of environment 0, with its number from 0,
+                whether to record it.
+            step_trigger: Asked before every step, with its number from 0, whether to start.
+            video_length: Frames a clip; None records until environment 0's episode ends.
+            name_prefix: Start of the file names.
+            disable_logger: Do not log the name of each file written.
+
+        Raises:
+            ValueError: There is no trigger, or `video_length` is not positive.
+        """
+        if episode_trigger is None and step_trigger is None:
+            raise ValueError(
+                "VideoRecorder would never record: give it an episode_trigger or a step_trigger."
+            )
+        if video_length is not None and video_length < 1:
+            raise ValueError(
+                f"video_length is {video_length}; it must be 1 or more, or None for an episode."
+            )
+        self.env = env
+        self.video_folder = Path(video_folder)
+        self.written = []
+        self.unavailable_reason = None
+        self._episode_trigger = episode_trigger
+        self._step_trigger = step_trigger
+        self._video_length = video_length
+        self._name_prefix = name_prefix
+        self._disable_logger = disable_logger
+        self._clip = None
+        self._step_count = 0
+        self._episode_count = 0
+        self._episode_steps = 0
+        self._asked_episode = -1
+
+    def __getattribute__(self, name: str) -> Any:
+        # Not __getattr__: the base class has properties of the environment, which would be found
+        # first and evaluated on the recorder.
+        if name.startswith("__") or name in _OWN:
+            return object.__getattribute__(self, name)
+        return getattr(object.__getattribute__(self, "env"), name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in _OWN:
+            object.__setattr__(self, name, value)
+        else:
+            setattr(self.env, name, value)
+
+    @property
+    def unwrapped(self) -> ManagerBasedRlEnv:
+        """The environment without any wrapper."""
+        return self.env.unwrapped
+
+    def step(self, action: torch.Tensor) -> Any:
+        """Step the environment, and record if it is time to."""
+        self._start_due_clip()
+        try:
+            result = self.env.step(action)
+            self._take_frame()
+        except BaseException:
+            self._finish_clip()
+            raise
+        self._count_step(bool(result[2][0]) or bool(result[3][0]))
+        return result
+
+    def reset(self, **kwargs: Any) -> Any:
+        """Reset the environment; a clip of one episode ends here."""
+        if self._episode_steps > 0 and kwargs.get("env_ids") is None:
+            self._count_step(episode_over=True, stepped=False)
+        return self.env.reset(**kwargs)
+
+    def render(self, camera: str | int | None = None) -> np.ndarray | None:
+        """The environment's own picture."""
+        return self.env.render(camera) if camera is not None else self.env.render()
+
+    def close(self) -> None:
+        """Finish the clip being recorded, then close the environment."""
+        try:
+            self._finish_clip()
+        finally:
+            self.env.close()
+
+    def _start_due_clip(self) -> None:
+        if self._clip is not None or self.unavailable_reason is not None:
+            return
+        suffix = None
+        if self._step_trigger is not None and self._step_trigger(self._step_count):
+            suffix = f"step-{self._step_count}"
+        elif self._episode_trigger is not None and self._asked_episode != self._episode_count:
+            # Asked once an episode, or a clip shorter than its episode would be recorded again and
+            # again into the same file.
+            self._asked_episode = self._episode_count
+            if self._episode_trigger(self._episode_count):
+                suffix = f"episode-{self._episode_count}"
+        if suffix is not None:
+            fps = (getattr(self.env, "metadata", None) or {}).get("render_fps") or _DEFAULT_FPS
+            path = self.video_folder / f"{self._name_prefix}-{suffix}.mp4"
+            self._clip = ClipWriter(path, float(fps))
+
+    def _take_frame(self) -> None:
+        if self._clip is None:
+            return
+        try:
+            frame = self.env.render()
+            if frame is not None:
+                image = np.asarray(frame)
+                # Of one image per environment, (n, H, W, 3), the clip shows environment 0.
+                self._clip.add(image[0] if image.ndim == 4 else image)
+        except RenderingUnavailableError as error:
+            self.unavailable_reason = str(error)
+            self._finish_clip()
+            log.warning("No video is recorded. %s", error)
+        except OSError as error:
+            # A full disk must not end a training run for the sake of a video.
+            log.error("The video is not complete. %s", error)
+            self._finish_clip()
+
+    def _count_step(self, episode_over: bool, stepped: bool = True) -> None:
+        if stepped:
+            self._step_count += 1
+            self._episode_steps += 1
+        if episode_over:
+            self._episode_count += 1
+            self._episode_steps = 0
+        if self._clip is None:
+            return
+        full = self._clip.num_frames == self._video_length
+        if full or (self._video_length is None and episode_over):
+            self._finish_clip()
+
+    def _finish_clip(self) -> None:
+        clip, self._clip = self._clip, None
+        if clip is None:
+            return
+        try:
+            path = clip.close()
+        except OSError as error:
+            log.error("The video is lost. %s", error)
+            return
+        if path is not None:
+            self.written.append(path)
+            if not self._disable_logger:
+                log.info("Wrote %d frames to %s.", clip.num_frames, path)
+
+
+# Names that are the recorder's and not the environment's.
+_OWN = frozenset(VideoRecorder.__annotations__) | frozenset(vars(VideoRecorder))
 
 
 class ClipWriter:
@@ -159,211 +349,3 @@ def _even_uint8(frame: np.ndarray) -> np.ndarray:
     if height % 2 or width % 2:
         image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
     return image
-
-
-# MERGED mjlab.utils.wrappers.video_recorder: Records videos of an environment while something else steps it.
-
-log = logging.getLogger(__name__)
-_DEFAULT_FPS = 30.0
-
-
-class VideoRecorder(ManagerBasedRlEnv):
-    """Wraps an environment: steps it, and writes clips of what it renders.
-
-    It stands in for the environment everywhere: every attribute that is not the recorder's own is
-    read from, and written to, the environment.
-
-    Before each step the triggers are asked, and a clip starts if one of them says so and none is
-    being recorded; the frame is taken after the step. A clip ends after `video_length` frames, or
-    at the end of environment 0's episode where that is None, and whenever stepping fails or the
-    recorder is closed: what was recorded is never lost. Where this machine cannot render, that is
-    logged once and stepping goes on (`unavailable_reason`).
-    """
-
-    _OWN = frozenset(
-        {
-            "env",
-            "video_folder",
-            "written",
-            "unavailable_reason",
-            "_episode_trigger",
-            "_step_trigger",
-            "_video_length",
-            "_name_prefix",
-            "_disable_logger",
-            "_clip",
-            "_step_count",
-            "_episode_count",
-            "_episode_steps",
-            "_asked_episode",
-            "_start_due_clip",
-            "_start_clip",
-            "_take_frame",
-            "_finish_clip",
-            "_count_step",
-            "step",
-            "reset",
-            "render",
-            "close",
-            "unwrapped",
-        }
-    )
-    """Names that are the recorder's and not the environment's."""
-
-    def __init__(
-        self,
-        env: ManagerBasedRlEnv,
-        video_folder: str | Path,
-        episode_trigger: Callable[[int], bool] | None = None,
-        step_trigger: Callable[[int], bool] | None = None,
-        video_length: int | None = None,
-        name_prefix: str = "rl-video",
-        disable_logger: bool = False,
-    ):
-        """Wrap `env`.
-
-        Args:
-            env: Environment made with `render_mode="rgb_array"`.
-            video_folder: Where `<prefix>-step-<n>.mp4` and `<prefix>-episode-<n>.mp4` go.
-            episode_trigger: Asked once an episode of environment 0, with its number from 0,
-                whether to record it.
-            step_trigger: Asked before every step, with its number from 0, whether to start.
-            video_length: Frames a clip; None records until environment 0's episode ends.
-            name_prefix: Start of the file names.
-            disable_logger: Do not log the name of each file written.
-
-        Raises:
-            ValueError: There is no trigger, or `video_length` is not positive.
-        """
-        if episode_trigger is None and step_trigger is None:
-            raise ValueError(
-                "VideoRecorder would never record: give it an episode_trigger or a step_trigger."
-            )
-        if video_length is not None and video_length < 1:
-            raise ValueError(
-                f"video_length is {video_length}; it must be 1 or more, or None for an episode."
-            )
-        self.env = env
-        self.video_folder = Path(video_folder)
-        self.written: list[Path] = []
-        self.unavailable_reason: str | None = None
-        self._episode_trigger = episode_trigger
-        self._step_trigger = step_trigger
-        self._video_length = video_length
-        self._name_prefix = name_prefix
-        self._disable_logger = disable_logger
-        self._clip: ClipWriter | None = None
-        self._step_count = 0
-        self._episode_count = 0
-        self._episode_steps = 0
-        self._asked_episode = -1
-
-    def __getattribute__(self, name: str) -> Any:
-        # Not __getattr__: the base class has properties of the environment, which would be found
-        # first and evaluated on the recorder.
-        if name.startswith("__") or name in VideoRecorder._OWN:
-            return object.__getattribute__(self, name)
-        return getattr(object.__getattribute__(self, "env"), name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name in VideoRecorder._OWN:
-            object.__setattr__(self, name, value)
-        else:
-            setattr(self.env, name, value)
-
-    @property
-    def unwrapped(self) -> ManagerBasedRlEnv:
-        """The environment without any wrapper."""
-        return self.env.unwrapped
-
-    def step(self, action: torch.Tensor) -> Any:
-        """Step the environment, and record if it is time to."""
-        self._start_due_clip()
-        try:
-            result = self.env.step(action)
-            self._take_frame()
-        except BaseException:
-            self._finish_clip()
-            raise
-        self._count_step(bool(result[2][0]) or bool(result[3][0]))
-        return result
-
-    def reset(self, **kwargs: Any) -> Any:
-        """Reset the environment; a clip of one episode ends here."""
-        if self._episode_steps > 0 and kwargs.get("env_ids") is None:
-            self._count_step(episode_over=True, stepped=False)
-        return self.env.reset(**kwargs)
-
-    def render(self, camera: str | int | None = None) -> np.ndarray | None:
-        """The environment's own picture."""
-        return self.env.render(camera) if camera is not None else self.env.render()
-
-    def close(self) -> None:
-        """Finish the clip being recorded, then close the environment."""
-        try:
-            self._finish_clip()
-        finally:
-            self.env.close()
-
-    def _start_due_clip(self) -> None:
-        if self._clip is not None or self.unavailable_reason is not None:
-            return
-        if self._step_trigger is not None and self._step_trigger(self._step_count):
-            self._start_clip(f"step-{self._step_count}")
-            return
-        # Asked once an episode, or a clip shorter than its episode would be recorded again and
-        # again into the same file.
-        if self._episode_trigger is not None and self._asked_episode != self._episode_count:
-            self._asked_episode = self._episode_count
-            if self._episode_trigger(self._episode_count):
-                self._start_clip(f"episode-{self._episode_count}")
-
-    def _start_clip(self, suffix: str) -> None:
-        fps = (getattr(self.env, "metadata", None) or {}).get("render_fps") or _DEFAULT_FPS
-        path = self.video_folder / f"{self._name_prefix}-{suffix}.mp4"
-        self._clip = ClipWriter(path, float(fps))
-
-    def _take_frame(self) -> None:
-        if self._clip is None:
-            return
-        try:
-            frame = self.env.render()
-            if frame is not None:
-                image = np.asarray(frame)
-                # Of one image per environment, (n, H, W, 3), the clip shows environment 0.
-                self._clip.add(image[0] if image.ndim == 4 else image)
-        except RenderingUnavailableError as error:
-            self.unavailable_reason = str(error)
-            self._finish_clip()
-            log.warning("No video is recorded. %s", error)
-        except OSError as error:
-            # A full disk must not end a training run for the sake of a video.
-            log.error("The video is not complete. %s", error)
-            self._finish_clip()
-
-    def _count_step(self, episode_over: bool, stepped: bool = True) -> None:
-        if stepped:
-            self._step_count += 1
-            self._episode_steps += 1
-        if episode_over:
-            self._episode_count += 1
-            self._episode_steps = 0
-        if self._clip is None:
-            return
-        full = self._clip.num_frames == self._video_length
-        if full or (self._video_length is None and episode_over):
-            self._finish_clip()
-
-    def _finish_clip(self) -> None:
-        clip, self._clip = self._clip, None
-        if clip is None:
-            return
-        try:
-            path = clip.close()
-        except OSError as error:
-            log.error("The video is lost. %s", error)
-            return
-        if path is not None:
-            self.written.append(path)
-            if not self._disable_logger:
-                log.info("Wrote %d frames to %s.", clip.num_frames, path)

@@ -1,12 +1,15 @@
-"""Randomization of one model field: the part that all functions of the table share."""
+"""Randomization of one model field: select, draw, write; and the factories of public functions.
+
+Each public function of `mjlab.envs.mdp.dr` stands in the file of its object (`geom`, `joint`, ...), most
+of them as one row: `geom_friction = field_term(__name__, "geom_friction", GEOM, ...)`.
+"""
 
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import torch
 
@@ -22,25 +25,18 @@ from mjlab.envs.mdp.dr._types import (
 )
 from mjlab.managers.event_manager import RecomputeLevel, requires_model_fields
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.utils.indexing import as_ids
+from mjlab.utils.indexing import as_columns, as_ids
 from mjlab.utils.lab_api.math import quat_from_euler_xyz, quat_mul
+from mjlab.utils.mujoco import dof_width, qpos_width
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    import torch
-
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
-    from mjlab.managers.scene_entity_config import SceneEntityCfg
 
+F = TypeVar("F", bound=Callable[..., Any])
 
-# MERGED mjlab.envs.mdp.dr._core: Which environments and which objects of an entity a randomization touches.
-
-
-# Numbers a joint contributes to qpos and to qvel, by mjtJoint: free, ball, slide, hinge.
-_QPOS_WIDTH = {0: 7, 1: 4, 2: 1, 3: 1}
-_DOF_WIDTH = {0: 6, 1: 3, 2: 1, 3: 1}
+ROBOT = SceneEntityCfg("robot")
+"""Default selection of the functions: everything of the entity called "robot"."""
 
 
 @dataclass(frozen=True)
@@ -55,24 +51,199 @@ class ObjectKind:
     """Attribute of `Entity` with the names, in the order of those ids."""
     global_ids: str
     """Attribute of `EntityIndexing` with the ids in the model, in that order too."""
-    start: str | None = None
-    """For values stored by address: the `MjModel` field with the first address of a joint."""
-    width: dict[int, int] | None = None
-    """For values stored by address: the number of addresses, by joint type."""
+    addresses: tuple[str, Callable[[int], int]] | None = None
+    """For values stored by address: the `MjModel` field with the first address of a joint, and the
+    number of addresses by joint type."""
 
 
 BODY = ObjectKind("body", "body_ids", "body_names", "body_ids")
 GEOM = ObjectKind("geom", "geom_ids", "geom_names", "geom_ids")
 SITE = ObjectKind("site", "site_ids", "site_names", "site_ids")
 JOINT = ObjectKind("joint", "joint_ids", "joint_names", "joint_ids")
-DOF = ObjectKind("joint", "joint_ids", "joint_names", "joint_ids", "jnt_dofadr", _DOF_WIDTH)
-QPOS = ObjectKind("joint", "joint_ids", "joint_names", "joint_ids", "jnt_qposadr", _QPOS_WIDTH)
+DOF = ObjectKind("joint", "joint_ids", "joint_names", "joint_ids", ("jnt_dofadr", dof_width))
+QPOS = ObjectKind("joint", "joint_ids", "joint_names", "joint_ids", ("jnt_qposadr", qpos_width))
 TENDON = ObjectKind("tendon", "tendon_ids", "tendon_names", "tendon_ids")
 CAMERA = ObjectKind("camera", "camera_ids", "camera_names", "cam_ids")
 LIGHT = ObjectKind("light", "light_ids", "light_names", "light_ids")
 MATERIAL = ObjectKind("material", "material_ids", "material_names", "mat_ids")
 TEXTURE = ObjectKind("texture", "texture_ids", "texture_names", "tex_ids")
 PAIR = ObjectKind("pair", "pair_ids", "pair_names", "pair_ids")
+
+
+# Public functions.
+
+
+def field_term(
+    module: str,
+    name: str,
+    kind: ObjectKind,
+    summary: str,
+    *,
+    field: str | None = None,
+    **options: Any,
+) -> FieldTerm:
+    """Return a public function that randomizes a model field.
+
+    Args:
+        module: Module that publishes the function: its home in configs and pickles.
+        name: Name of the function.
+        kind: Objects that own the field.
+        summary: First paragraph of the docstring, with units.
+        field: Field of `MjModel`. None: called like the function.
+        options: Other fields of `FieldRow`.
+    """
+    row = FieldRow(name, field or name, kind, **options)
+
+    def term(
+        env: ManagerBasedRlEnv,
+        env_ids: torch.Tensor | None,
+        ranges: Ranges,
+        asset_cfg: SceneEntityCfg = ROBOT,
+        distribution: Distribution | str = "uniform",
+        operation: Operation | str = row.operation,
+        axes: list[int] | None = None,
+        shared_random: bool = False,
+    ) -> None:
+        randomize(
+            row, env, env_ids, ranges, asset_cfg, distribution, operation, axes, shared_random
+        )
+
+    default_axes = "all" if row.default_axes is None else str(list(row.default_axes))
+    return _published(term, module, row, summary + _FIELD_ARGS.format(axes=default_axes))
+
+
+def rotation_term(
+    module: str, name: str, kind: ObjectKind, summary: str, **options: Any
+) -> RotationTerm:
+    """Return a public function that perturbs a quaternion field; arguments as of `field_term`."""
+    row = FieldRow(name, name, kind, rotation=True, **options)
+
+    def term(
+        env: ManagerBasedRlEnv,
+        env_ids: torch.Tensor | None,
+        roll_range: tuple[float, float] = (0.0, 0.0),
+        pitch_range: tuple[float, float] = (0.0, 0.0),
+        yaw_range: tuple[float, float] = (0.0, 0.0),
+        distribution: Distribution | str = "uniform",
+        asset_cfg: SceneEntityCfg = ROBOT,
+    ) -> None:
+        angles = (roll_range, pitch_range, yaw_range)
+        rotate(row, env, env_ids, angles, asset_cfg, distribution)
+
+    return _published(term, module, row, summary + _ROTATION_ARGS)
+
+
+def writes(row: FieldRow) -> Callable[[F], F]:
+    """Declare, as a decorator, that a function randomizes the field of `row`, its attribute `row`."""
+
+    def declare(function: F) -> F:
+        setattr(function, "row", row)  # noqa: B010
+        return requires_model_fields(*row.fields, recompute=row.recompute)(function)
+
+    return declare
+
+
+class FieldTerm(Protocol):
+    """Function that randomizes a field."""
+
+    row: FieldRow
+
+    def __call__(
+        self,
+        env: ManagerBasedRlEnv,
+        env_ids: torch.Tensor | None,
+        ranges: Ranges,
+        asset_cfg: SceneEntityCfg = ...,
+        distribution: Distribution | str = ...,
+        operation: Operation | str = ...,
+        axes: list[int] | None = ...,
+        shared_random: bool = ...,
+    ) -> None: ...
+
+
+class RotationTerm(Protocol):
+    """Function that perturbs an orientation."""
+
+    row: FieldRow
+
+    def __call__(
+        self,
+        env: ManagerBasedRlEnv,
+        env_ids: torch.Tensor | None,
+        roll_range: tuple[float, float] = ...,
+        pitch_range: tuple[float, float] = ...,
+        yaw_range: tuple[float, float] = ...,
+        distribution: Distribution | str = ...,
+        asset_cfg: SceneEntityCfg = ...,
+    ) -> None: ...
+
+
+_FIELD_ARGS = """
+
+Args:
+    env_ids: Environments to change; None means all.
+    ranges: Pair of numbers (tuple or list) for all target axes; or a dict of axis to pair; or a
+        dict of name pattern to either, where each pattern must match object names of the entity
+        in full and replaces the selection of `asset_cfg`.
+    asset_cfg: Entity and objects.
+    distribution: "uniform" (lower, upper), "log_uniform" (lower, upper), "gaussian" (mean,
+        standard deviation), or a `Distribution`.
+    operation: "abs" sets the sample, `=U(a, b)`; "scale" multiplies the compile-time default by it,
+        `*U(a, b)`; "add" adds it to the default, `+U(a, b)`; or an `Operation`.
+    axes: Axes of the field to change. Default: the keys of `ranges`, else {axes}.
+    shared_random: Draw one value per environment and axis for all objects.
+
+Raises:
+    ValueError: unknown name, pattern without match, bad range, or axis the field does not have.
+"""
+_ROTATION_ARGS = """
+
+Roll, pitch and yaw (rad) turn about the fixed x, y and z axes of the frame in which the
+orientation is given, starting from the default: repeating does not accumulate.
+
+Args:
+    env_ids: Environments to change; None means all.
+    roll_range, pitch_range, yaw_range: Pairs of numbers (rad), drawn per environment and object.
+    distribution: "uniform", "log_uniform", "gaussian", or a `Distribution`.
+    asset_cfg: Entity and objects.
+
+Raises:
+    ValueError: unknown distribution or bad range.
+"""
+
+
+@dataclass(frozen=True)
+class FieldRow:
+    """Model field, and how a public function randomizes it."""
+
+    name: str
+    """Name of the public function."""
+    field: str
+    """Field of `MjModel`."""
+    kind: ObjectKind
+    """Objects that own the field."""
+    default_axes: tuple[int, ...] | None = None
+    """Axes of the last dimension changed when the caller names none; None means all of them."""
+    operation: str = "abs"
+    """Default operation."""
+    recompute: RecomputeLevel = RecomputeLevel.none
+    """Constants that depend on the field."""
+    rotation: bool = False
+    """Whether the field is a quaternion, perturbed by roll, pitch and yaw."""
+    unit: bool = False
+    """Whether the field is a direction: kept at length 1, with untargeted axes at their defaults,
+    because their current values already depend on the axes drawn last time."""
+    also_writes: tuple[str, ...] = ()
+    """Further fields that `after` writes."""
+    before: Callable[[Selection], None] | None = None
+    """Called before anything is written; refuses what cannot be randomized."""
+    after: Callable[[Selection], None] | None = None
+    """Called after the write, to bring what depends on the field up to date."""
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """All model fields the function writes."""
+        return (self.field, *self.also_writes)
 
 
 @dataclass(frozen=True)
@@ -107,106 +278,7 @@ class Selection:
         return [names[i] for i in self.local_ids.tolist()]
 
 
-def select(
-    env: ManagerBasedRlEnv,
-    env_ids: torch.Tensor | None,
-    asset_cfg: SceneEntityCfg,
-    kind: ObjectKind,
-    pattern: str | None = None,
-) -> Selection:
-    """Resolve ids to a `Selection`.
-
-    Args:
-        env_ids: Environments; None means all.
-        asset_cfg: Entity and, without a pattern, its selected objects.
-        pattern: Regular expression that object names of the entity must match in full; it
-            replaces the selection of `asset_cfg`.
-
-    Raises `ValueError` if a pattern matches nothing.
-    """
-    entity: Entity = env.scene[asset_cfg.name]
-    all_ids: torch.Tensor = getattr(entity.data.indexing, kind.global_ids)
-    # Names are looked up for patterns only: randomization may run at nearly every step.
-    local_ids = (
-        _local_ids(getattr(asset_cfg, kind.cfg_ids), len(all_ids))
-        if pattern is None
-        else _matching_ids(pattern, getattr(entity, kind.entity_names), kind, asset_cfg.name)
-    )
-    ids = torch.tensor(local_ids, dtype=torch.long, device=env.device)
-    global_ids = all_ids[ids].long()
-    columns = global_ids if kind.start is None else _addresses(env, kind, global_ids)
-    return Selection(env, entity, kind, as_ids(env_ids, env.num_envs, env.device), ids, columns)
-
-
-def _local_ids(ids: slice | int | Sequence[int] | torch.Tensor, count: int) -> list[int]:
-    if isinstance(ids, slice):
-        return list(range(count))[ids]
-    if isinstance(ids, torch.Tensor):
-        return ids.tolist()
-    return [ids] if isinstance(ids, int) else list(ids)
-
-
-def _matching_ids(pattern: str, names: Sequence[str], kind: ObjectKind, entity: str) -> list[int]:
-    ids = [i for i, name in enumerate(names) if re.fullmatch(pattern, name)]
-    if not ids:
-        raise ValueError(
-            f"ranges: the pattern {pattern!r} matches no {kind.name} of entity {entity!r}. "
-            f"Available: {list(names)}."
-        )
-    return ids
-
-
-def _addresses(env: ManagerBasedRlEnv, kind: ObjectKind, joints: torch.Tensor) -> torch.Tensor:
-    """Return every address of the joints: one of a hinge or slide, several of a ball joint."""
-    assert kind.start is not None
-    assert kind.width is not None
-    model = env.sim.mj_model
-    starts, types = getattr(model, kind.start), model.jnt_type
-    addresses = [
-        int(starts[joint]) + k
-        for joint in joints.tolist()
-        for k in range(kind.width[int(types[joint])])
-    ]
-    return torch.tensor(addresses, dtype=torch.long, device=env.device)
-
-
-@dataclass(frozen=True)
-class FieldRow:
-    """One row of the table: a model field and how it is randomized."""
-
-    name: str
-    """Name of the public function."""
-    field: str
-    """Field of `MjModel`."""
-    kind: ObjectKind
-    """Objects that own the field."""
-    summary: str
-    """What the function does, with units: the first paragraph of its docstring."""
-    default_axes: tuple[int, ...] | None = None
-    """Axes of the last dimension changed when the caller names none; None means all of them."""
-    valid_axes: tuple[int, ...] | None = None
-    """Axes that may be named; None means all of the last dimension."""
-    operation: str = "abs"
-    """Default operation."""
-    recompute: RecomputeLevel = RecomputeLevel.none
-    """Constants that depend on the field."""
-    rotation: bool = False
-    """Whether the field is a quaternion, perturbed by roll, pitch and yaw."""
-    unit: bool = False
-    """Whether the field is a direction: kept at length 1, with untargeted axes at their defaults,
-    because their current values already depend on the axes drawn last time."""
-    also_writes: tuple[str, ...] = ()
-    """Further fields that `after` writes."""
-    before: Callable[[Selection], None] | None = None
-    """Called before anything is written; refuses what cannot be randomized."""
-    after: Callable[[Selection], None] | None = None
-    """Called after the write, to bring what depends on the field up to date."""
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        """All model fields the function writes."""
-        return (self.field, *self.also_writes)
-
+# Write.
 
 Targets = list[tuple[Selection, tuple[int, ...]]]
 """What was written: selections, each with its axes (empty for a field without axes)."""
@@ -229,21 +301,20 @@ def randomize(
     axes. Raises `ValueError` for unknown names, bad ranges and axes the field does not have.
     """
     dist, op = resolve_distribution(distribution), resolve_operation(operation)
-    width = _width(env, row.field)
+    shape = model_field(env, row.field).shape
+    has_axes = len(shape) > 2
     jobs = []
     for pattern, spec in _by_pattern(ranges):
         selection = select(env, env_ids, asset_cfg, row.kind, pattern)
-        jobs.append((selection, _bounds_by_axis(row, spec, axes, width)))
+        jobs.append((selection, _bounds_by_axis(row, spec, axes, shape[-1] if has_axes else 1)))
     for selection, _ in jobs:
         if row.before is not None:
             row.before(selection)
-    written: Targets = []
     for selection, bounds in jobs:
         _write(row, selection, bounds, dist, op, shared_random)
         if row.after is not None:
             row.after(selection)
-        written.append((selection, tuple(axis for axis in bounds if width is not None)))
-    return written
+    return [(selection, tuple(bounds) if has_axes else ()) for selection, bounds in jobs]
 
 
 def targets_of(
@@ -276,6 +347,52 @@ def rotate(
     field = model_field(env, row.field)
     new = quat_mul(delta, default_values(selection, row.field))
     field[selection.index] = keep_absent(selection, new, field)
+
+
+# Selection and values, also for functions that are not rows.
+
+
+def select(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor | None,
+    asset_cfg: SceneEntityCfg,
+    kind: ObjectKind,
+    pattern: str | None = None,
+) -> Selection:
+    """Resolve ids to a `Selection`.
+
+    Args:
+        env_ids: Environments; None means all.
+        asset_cfg: Entity and, without a pattern, its selected objects.
+        pattern: Regular expression that object names of the entity must match in full; it
+            replaces the selection of `asset_cfg`.
+
+    Raises `ValueError` if a pattern matches nothing.
+    """
+    entity: Entity = env.scene[asset_cfg.name]
+    all_ids: torch.Tensor = getattr(entity.data.indexing, kind.global_ids)
+    # Names are looked up for patterns only: randomization may run at nearly every step.
+    if pattern is None:
+        chosen = as_columns(getattr(asset_cfg, kind.cfg_ids), env.device)
+        local_ids = torch.arange(len(all_ids), device=env.device)[chosen]
+    else:
+        names = getattr(entity, kind.entity_names)
+        matches = [i for i, name in enumerate(names) if re.fullmatch(pattern, name)]
+        if not matches:
+            raise ValueError(
+                f"ranges: the pattern {pattern!r} matches no {kind.name} of entity "
+                f"{asset_cfg.name!r}. Available: {list(names)}."
+            )
+        local_ids = torch.tensor(matches, dtype=torch.long, device=env.device)
+    places = all_ids[local_ids].long()
+    if kind.addresses is not None:
+        model, (start, width) = env.sim.mj_model, kind.addresses
+        starts, types = getattr(model, start), model.jnt_type
+        addresses = [starts[j] + k for j in places.tolist() for k in range(width(types[j]))]
+        places = torch.tensor(addresses, dtype=torch.long, device=env.device)
+    return Selection(
+        env, entity, kind, as_ids(env_ids, env.num_envs, env.device), local_ids, places
+    )
 
 
 def model_field(env: ManagerBasedRlEnv, field: str) -> torch.Tensor:
@@ -311,10 +428,29 @@ def keep_absent(selection: Selection, new: torch.Tensor, field: torch.Tensor) ->
     return torch.where(mask.view(*mask.shape, *[1] * (new.ndim - 2)), field[selection.index], new)
 
 
-def _width(env: ManagerBasedRlEnv, field: str) -> int | None:
-    """Return the size of the last dimension of a field, or None for one number an object."""
-    shape = getattr(env.sim.model, field).shape
-    return None if len(shape) == 2 else shape[-1]
+def choose_ids(targets: Selection, choices: Selection, shared_random: bool) -> torch.Tensor:
+    """Return model ids drawn from `choices`, int32, for each environment and target (R, C).
+
+    Raises `ValueError` if there is nothing to choose from.
+    """
+    kind, count = choices.kind.name, len(choices.columns)
+    if count == 0:
+        raise ValueError(
+            f"No {kind} to choose from: the selection of entity is empty. "
+            f"Set {kind}_names in the SceneEntityCfg to {kind}s that the entity has."
+        )
+    rows, columns = targets.shape
+    shape = (rows, 1 if shared_random else columns)
+    picks = torch.randint(count, shape, device=targets.env.device).expand(rows, columns)
+    return choices.columns[picks].int()
+
+
+def _published(term: Any, module: str, row: FieldRow, docstring: str) -> Any:
+    """Give a made function the name, home and docstring it would have if written by hand."""
+    term.__name__ = term.__qualname__ = row.name
+    term.__module__ = module
+    term.__doc__ = docstring
+    return writes(row)(term)
 
 
 def _by_pattern(ranges: Any) -> Iterator[tuple[str | None, Any]]:
@@ -328,28 +464,23 @@ def _by_pattern(ranges: Any) -> Iterator[tuple[str | None, Any]]:
 
 
 def _bounds_by_axis(
-    row: FieldRow, ranges: Any, axes: list[int] | tuple[int, ...] | None, width: int | None
+    row: FieldRow, ranges: Any, axes: list[int] | tuple[int, ...] | None, size: int
 ) -> dict[int, tuple[float, float]]:
     """Return the bounds of each target axis, in the order in which they are drawn.
 
     A field with one number an object counts as having the single axis 0.
     """
-    size = 1 if width is None else width
     if axes is not None:
         targets = list(axes)
     elif isinstance(ranges, dict):
         targets = list(ranges)
-    elif row.default_axes is not None:
-        targets = list(row.default_axes)
     else:
-        targets = list(range(size))
-    valid = row.valid_axes or tuple(range(size))
-    wrong = [axis for axis in targets if axis not in valid]
+        targets = list(range(size) if row.default_axes is None else row.default_axes)
+    wrong = [axis for axis in targets if axis not in range(size)]
     if wrong:
-        raise ValueError(f"{row.name} has no axes {wrong}; the valid axes are {list(valid)}.")
+        raise ValueError(f"{row.name} has no axes {wrong}; the valid axes are {[*range(size)]}.")
     if not isinstance(ranges, dict):
-        bounds = read_bounds(ranges, f"{row.name}: ranges")
-        return dict.fromkeys(targets, bounds)
+        return dict.fromkeys(targets, read_bounds(ranges, f"{row.name}: ranges"))
     missing = [axis for axis in targets if axis not in ranges]
     if missing:
         raise ValueError(f"{row.name}: ranges has no entry for the axes {missing}: {ranges!r}.")
@@ -364,6 +495,7 @@ def _write(
     op: Operation,
     shared_random: bool,
 ) -> None:
+    """Draw a sample for each axis and write `op.combine(base, samples)`."""
     field = model_field(selection.env, row.field)
     from_default = op.uses_defaults or (row.unit and op is ABS)
     base = default_values(selection, row.field) if from_default else field[selection.index]
@@ -381,162 +513,15 @@ def _write(
             rnd = sample
     new = keep_absent(selection, op.combine(base, rnd), field)
     if row.unit:
-        field[selection.index] = _normalized(row, new)
+        norms = new.norm(dim=-1, keepdim=True)
+        if bool((norms < 1e-6).any()):
+            raise ValueError(
+                f"{row.name}: a zero vector was drawn, which is no direction. "
+                "Choose ranges that exclude the origin."
+            )
+        field[selection.index] = new / norms
     elif has_axes:
         for axis in bounds:
             field[(*selection.index, axis)] = new[..., axis]
     else:
         field[selection.index] = new
-
-
-def _normalized(row: FieldRow, vectors: torch.Tensor) -> torch.Tensor:
-    norms = vectors.norm(dim=-1, keepdim=True)
-    if bool((norms < 1e-6).any()):
-        raise ValueError(
-            f"{row.name}: a zero vector was drawn, which is no direction. "
-            "Choose ranges that exclude the origin."
-        )
-    return vectors / norms
-
-
-# MERGED mjlab.envs.mdp.dr._core: Makes public functions, with real signatures and docstrings, from rows of the table.
-
-ROBOT = SceneEntityCfg("robot")
-"""Default selection of the functions: everything of the entity called "robot"."""
-_FIELD_ARGS = """
-Args:
-    env_ids: Environments to change; None means all.
-    ranges: Pair of numbers (tuple or list) for all target axes; or a dict of axis to pair; or a
-        dict of name pattern to either, where each pattern must match object names of the entity
-        in full and replaces the selection of `asset_cfg`.
-    asset_cfg: Entity and objects.
-    distribution: "uniform" (lower, upper), "log_uniform" (lower, upper), "gaussian" (mean,
-        standard deviation), or a `Distribution`.
-    operation: "abs" sets the sample, "scale" multiplies the compile-time default by it, "add"
-        adds it to the default; or an `Operation`.
-    axes: Axes of the field to change. Default: the keys of `ranges`, else {axes}.
-    shared_random: Draw one value per environment and axis for all objects.
-
-Raises:
-    ValueError: unknown name, pattern without match, bad range, or axis the field does not have.
-"""
-_ROTATION_ARGS = """
-Roll, pitch and yaw (rad) turn about the fixed x, y and z axes of the frame in which the
-orientation is given, starting from the default: repeating does not accumulate.
-
-Args:
-    env_ids: Environments to change; None means all.
-    roll_range, pitch_range, yaw_range: Pairs of numbers (rad), drawn per environment and object.
-    distribution: "uniform", "log_uniform", "gaussian", or a `Distribution`.
-    asset_cfg: Entity and objects.
-
-Raises:
-    ValueError: unknown distribution or bad range.
-"""
-
-
-class FieldTerm(Protocol):
-    """Signature of a function that randomizes a field."""
-
-    def __call__(
-        self,
-        env: ManagerBasedRlEnv,
-        env_ids: torch.Tensor | None,
-        ranges: Ranges,
-        asset_cfg: SceneEntityCfg = ...,
-        distribution: Distribution | str = ...,
-        operation: Operation | str = ...,
-        axes: list[int] | None = ...,
-        shared_random: bool = ...,
-    ) -> None: ...
-
-
-class RotationTerm(Protocol):
-    """Signature of a function that perturbs an orientation."""
-
-    def __call__(
-        self,
-        env: ManagerBasedRlEnv,
-        env_ids: torch.Tensor | None,
-        roll_range: tuple[float, float] = ...,
-        pitch_range: tuple[float, float] = ...,
-        yaw_range: tuple[float, float] = ...,
-        distribution: Distribution | str = ...,
-        asset_cfg: SceneEntityCfg = ...,
-    ) -> None: ...
-
-
-def field_term(name: str) -> FieldTerm:
-    """Return the function for the table's row `name`; call it in the module that publishes it."""
-    from mjlab.envs.mdp.dr._table import TABLE
-
-    row = TABLE[name]
-
-    @requires_model_fields(*row.fields, recompute=row.recompute)
-    def term(
-        env: ManagerBasedRlEnv,
-        env_ids: torch.Tensor | None,
-        ranges: Ranges,
-        asset_cfg: SceneEntityCfg = ROBOT,
-        distribution: Distribution | str = "uniform",
-        operation: Operation | str = row.operation,
-        axes: list[int] | None = None,
-        shared_random: bool = False,
-    ) -> None:
-        randomize(
-            row, env, env_ids, ranges, asset_cfg, distribution, operation, axes, shared_random
-        )
-
-    default_axes = "all" if row.default_axes is None else str(list(row.default_axes))
-    return _published(term, row, _FIELD_ARGS.format(axes=default_axes))
-
-
-def rotation_term(name: str) -> RotationTerm:
-    """Like `field_term`, for the rows that are quaternions."""
-    from mjlab.envs.mdp.dr._table import TABLE
-
-    row = TABLE[name]
-
-    @requires_model_fields(*row.fields, recompute=row.recompute)
-    def term(
-        env: ManagerBasedRlEnv,
-        env_ids: torch.Tensor | None,
-        roll_range: tuple[float, float] = (0.0, 0.0),
-        pitch_range: tuple[float, float] = (0.0, 0.0),
-        yaw_range: tuple[float, float] = (0.0, 0.0),
-        distribution: Distribution | str = "uniform",
-        asset_cfg: SceneEntityCfg = ROBOT,
-    ) -> None:
-        angles = (roll_range, pitch_range, yaw_range)
-        rotate(row, env, env_ids, angles, asset_cfg, distribution)
-
-    return _published(term, row, _ROTATION_ARGS)
-
-
-def _published(term: Any, row: FieldRow, arguments: str) -> Any:
-    """Give a made function the name, home and docstring it would have if written by hand."""
-    term.__name__ = term.__qualname__ = row.name
-    # Two frames up is the module that publishes the function: its home in configs and pickles.
-    term.__module__ = sys._getframe(2).f_globals["__name__"]
-    term.__doc__ = f"{row.summary}\n{arguments}"
-    return term
-
-
-# MERGED mjlab.envs.mdp.dr._core: Uniform choice among objects, for fields that hold ids.
-
-
-def choose_ids(targets: Selection, choices: Selection, shared_random: bool) -> torch.Tensor:
-    """Return model ids drawn from `choices`, int32, for each environment and target (R, C).
-
-    Raises `ValueError` if there is nothing to choose from.
-    """
-    kind, count = choices.kind.name, len(choices.columns)
-    if count == 0:
-        raise ValueError(
-            f"No {kind} to choose from: the selection of entity is empty. "
-            f"Set {kind}_names in the SceneEntityCfg to {kind}s that the entity has."
-        )
-    rows, columns = targets.shape
-    shape = (rows, 1 if shared_random else columns)
-    picks = torch.randint(count, shape, device=targets.env.device).expand(rows, columns)
-    return choices.columns[picks].int()

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
+import numpy as np
 import torch
 
 from mjlab.actuator import (
@@ -37,6 +38,7 @@ from mjlab.envs.mdp.dr._types import (
     resolve_operation,
 )
 from mjlab.managers.event_manager import requires_model_fields
+from mjlab.utils.errors import WrongTypeError
 from mjlab.utils.indexing import as_columns, as_ids
 
 if TYPE_CHECKING:
@@ -49,103 +51,9 @@ if TYPE_CHECKING:
     from mjlab.managers.scene_entity_config import SceneEntityCfg
     from mjlab.utils.mujoco import CommandField
 
-
-# MERGED mjlab.envs.mdp.dr.actuator: Single actuators of an entity, found in the groups that the entity keeps them in.
-
-
-@dataclass(frozen=True)
-class SelectedActuator:
-    """The selected targets of one actuator object (one per actuator config)."""
-
-    entity: Entity
-    actuator: Actuator
-    rows: torch.Tensor
-    """Environment ids, (R,)."""
-    targets: torch.Tensor
-    """Positions of the selected targets inside the actuator, (K,)."""
-    elements: torch.Tensor
-    """Ids in the model of the MuJoCo actuators of these targets, (E, K); most kinds have E = 1."""
-
-    def draw(
-        self, distribution: Distribution, bounds: tuple[float, float], device: str
-    ) -> torch.Tensor:
-        """Draw one number per environment and target, (R, K)."""
-        return draw(distribution, bounds, (len(self.rows), len(self.targets)), device)
-
-
-def selected_actuators(
-    env: ManagerBasedRlEnv, rows: torch.Tensor, asset_cfg: SceneEntityCfg
-) -> Iterator[SelectedActuator]:
-    """Yield the actuator objects of an entity that own selected actuators.
-
-    `asset_cfg.actuator_ids` counts single actuators, as `actuator_names` does.
-    """
-    entity: Entity = env.scene[asset_cfg.name]
-    chosen = entity.data.indexing.actuator_ids[as_columns(asset_cfg.actuator_ids, env.device)]
-    for actuator in entity.actuators:
-        ids, count = actuator.global_element_ids, len(actuator.target_names)
-        # Kinds of a user's own may have another layout; who needs single elements refuses them.
-        elements = ids.reshape(-1, count) if len(ids) % count == 0 else ids[None, :]
-        is_chosen = torch.isin(elements, chosen.to(elements.dtype)).any(dim=0)
-        targets = is_chosen.nonzero().flatten()
-        if len(targets):
-            yield SelectedActuator(entity, actuator, rows, targets, elements[:, targets].long())
-
+__all__ = ["effort_limits", "pd_gains"]
 
 __getattr__ = older_names(__name__)
-
-
-class Place(NamedTuple):
-    """Where a figure stands in the model."""
-
-    field: str
-    axis: int
-    sign: float
-    element: int = 0
-    """Which of a target's MuJoCo actuators."""
-
-
-class Gains(NamedTuple):
-    """Places of the two gains."""
-
-    kp: tuple[Place, ...]
-    kd: tuple[Place, ...]
-
-
-_SERVO_GAINS = Gains(
-    kp=(Place("actuator_gainprm", 0, 1.0), Place("actuator_biasprm", 1, -1.0)),
-    kd=(Place("actuator_biasprm", 2, -1.0),),
-)
-
-# A velocity servo has no stiffness.
-_VELOCITY_GAINS = Gains(
-    kp=(), kd=(Place("actuator_gainprm", 0, 1.0), Place("actuator_biasprm", 2, -1.0))
-)
-
-# A `<pid>` has its integral gain where a servo has the gain of its control.
-_PID_GAINS = Gains(
-    kp=(Place("actuator_biasprm", 1, -1.0),), kd=(Place("actuator_biasprm", 2, -1.0),)
-)
-
-# Two MuJoCo actuators a target: the first follows the position, the second the velocity.
-_PD_GAINS = Gains(
-    kp=(Place("actuator_gainprm", 0, 1.0, 0), Place("actuator_biasprm", 1, -1.0, 0)),
-    kd=(Place("actuator_gainprm", 0, 1.0, 1), Place("actuator_biasprm", 2, -1.0, 1)),
-)
-
-
-def _range_of(field: str) -> tuple[Place, ...]:
-    return Place(field, 0, -1.0), Place(field, 1, 1.0)
-
-
-_FORCE_RANGE = _range_of("actuator_forcerange")
-_MOTOR_RANGES = (*_FORCE_RANGE, *_range_of("actuator_ctrlrange"))
-
-# The peak force of a muscle, and the figure from which MuJoCo takes it where it is negative. Both
-# stand twice, for the active and the passive force.
-_MUSCLE_FORCE = tuple(
-    Place(field, axis, 1.0) for field in ("actuator_gainprm", "actuator_biasprm") for axis in (2, 3)
-)
 
 
 @requires_model_fields("actuator_gainprm", "actuator_biasprm")
@@ -183,12 +91,13 @@ def pd_gains(
     places = [_gain_places(env, selected) for selected in chosen]
     for selected, gains in zip(chosen, places, strict=True):
         kp, kd = (selected.draw(dist, pair, env.device) for pair in bounds)
-        if isinstance(selected.actuator, IdealPdActuator):
-            _set_ideal_gains(selected, op, kp, kd)
-            continue
-        if isinstance(selected.actuator, BuiltinDcMotorActuator):
+        actuator = selected.actuator
+        if isinstance(actuator, IdealPdActuator):
+            stiffness = _merged(selected, actuator.stiffness, actuator.default_stiffness, op, kp)
+            damping = _merged(selected, actuator.damping, actuator.default_damping, op, kd)
+            actuator.set_gains(selected.rows, kp=stiffness, kd=damping)
+        elif isinstance(actuator, BuiltinDcMotorActuator):
             _set_dc_motor_gains(env, selected, op, kp, kd)
-            continue
         for samples, targets in ((kp, gains.kp), (kd, gains.kd)):
             for place in targets:
                 _write(env, selected.rows, selected.elements[place.element], place, op, samples)
@@ -230,8 +139,11 @@ def effort_limits(
     places = [_limit_places(env, selected) for selected in chosen]
     for selected, (controls, targets) in zip(chosen, places, strict=True):
         samples = selected.draw(dist, bounds, env.device)
-        if isinstance(selected.actuator, IdealPdActuator):
-            _set_ideal_limits(selected, op, samples)
+        actuator = selected.actuator
+        if isinstance(actuator, IdealPdActuator):
+            default = actuator.default_force_limit
+            merged = _merged(selected, actuator.force_limit, default, op, samples)
+            actuator.set_effort_limit(selected.rows, merged)
         for place in targets:
             values, at = samples, controls
             if place.field == "actuator_ctrlrange":
@@ -241,6 +153,87 @@ def effort_limits(
                     gains = _default(env, selected.rows, controls, "actuator_gainprm", 0)
                     values = samples / gains.abs()
             _write(env, selected.rows, at, place, op, values)
+
+
+@dataclass(frozen=True)
+class SelectedActuator:
+    """The selected targets of one actuator object (one per actuator config)."""
+
+    entity: Entity
+    actuator: Actuator
+    rows: torch.Tensor
+    """Environment ids, (R,)."""
+    targets: torch.Tensor
+    """Positions of the selected targets inside the actuator, (K,)."""
+    elements: torch.Tensor
+    """Ids in the model of the MuJoCo actuators of these targets, (E, K); most kinds have E = 1."""
+
+    def draw(
+        self, distribution: Distribution, bounds: tuple[float, float], device: str
+    ) -> torch.Tensor:
+        """Draw one number per environment and target, (R, K)."""
+        return draw(distribution, bounds, (len(self.rows), len(self.targets)), device)
+
+
+def selected_actuators(
+    env: ManagerBasedRlEnv, rows: torch.Tensor, asset_cfg: SceneEntityCfg
+) -> Iterator[SelectedActuator]:
+    """Yield the actuator objects of an entity that own selected actuators.
+
+    `asset_cfg.actuator_ids` counts single actuators, as `actuator_names` does.
+    """
+    entity: Entity = env.scene[asset_cfg.name]
+    chosen = entity.data.indexing.actuator_ids[as_columns(asset_cfg.actuator_ids, env.device)]
+    for actuator in entity.actuators:
+        ids, count = actuator.global_element_ids, len(actuator.target_names)
+        # Kinds of a user's own may have another layout; who needs single elements refuses them.
+        elements = ids.reshape(-1, count) if len(ids) % count == 0 else ids[None, :]
+        is_chosen = torch.isin(elements, chosen.to(elements.dtype)).any(dim=0)
+        targets = is_chosen.nonzero().flatten()
+        if len(targets):
+            yield SelectedActuator(entity, actuator, rows, targets, elements[:, targets].long())
+
+
+# Gains: their places in the model.
+
+
+class Place(NamedTuple):
+    """Where a figure stands in the model."""
+
+    field: str
+    axis: int
+    sign: float
+    element: int = 0
+    """Which of a target's MuJoCo actuators."""
+
+
+class Gains(NamedTuple):
+    """Places of the two gains."""
+
+    kp: tuple[Place, ...]
+    kd: tuple[Place, ...]
+
+
+_SERVO_GAINS = Gains(
+    kp=(Place("actuator_gainprm", 0, 1.0), Place("actuator_biasprm", 1, -1.0)),
+    kd=(Place("actuator_biasprm", 2, -1.0),),
+)
+
+# A velocity servo has no stiffness.
+_VELOCITY_GAINS = Gains(
+    kp=(), kd=(Place("actuator_gainprm", 0, 1.0), Place("actuator_biasprm", 2, -1.0))
+)
+
+# A `<pid>` has its integral gain where a servo has the gain of its control.
+_PID_GAINS = Gains(
+    kp=(Place("actuator_biasprm", 1, -1.0),), kd=(Place("actuator_biasprm", 2, -1.0),)
+)
+
+# Two MuJoCo actuators a target: the first follows the position, the second the velocity.
+_PD_GAINS = Gains(
+    kp=(Place("actuator_gainprm", 0, 1.0, 0), Place("actuator_biasprm", 1, -1.0, 0)),
+    kd=(Place("actuator_gainprm", 0, 1.0, 1), Place("actuator_biasprm", 2, -1.0, 1)),
+)
 
 
 def _gain_places(env: ManagerBasedRlEnv, selected: SelectedActuator) -> Gains:
@@ -268,17 +261,34 @@ def _gain_places(env: ManagerBasedRlEnv, selected: SelectedActuator) -> Gains:
         if (kinds == mujoco.mjtGain.mjGAIN_PID).all():
             return _PID_GAINS
         if (kinds != mujoco.mjtGain.mjGAIN_FIXED).any():
-            raise TypeError(_refusal("pd_gains", actuator, _WITH_GAINS))
+            raise WrongTypeError(_refusal("pd_gains", actuator, _WITH_GAINS))
     if _reads(actuator, "position", BuiltinPositionActuator):
         return _SERVO_GAINS
     if _reads(actuator, "velocity", BuiltinVelocityActuator):
         return _VELOCITY_GAINS
-    raise TypeError(_refusal("pd_gains", actuator, _WITH_GAINS))
+    raise WrongTypeError(_refusal("pd_gains", actuator, _WITH_GAINS))
 
 
 _WITH_GAINS = (
     "position and velocity servos (builtin or XML), <pid> of the XML, BuiltinPdActuator, "
     "BuiltinDcMotorActuator, IdealPdActuator and its subclasses"
+)
+
+
+# Effort limits: their places in the model.
+
+
+def _range_of(field: str) -> tuple[Place, ...]:
+    return Place(field, 0, -1.0), Place(field, 1, 1.0)
+
+
+_FORCE_RANGE = _range_of("actuator_forcerange")
+_MOTOR_RANGES = (*_FORCE_RANGE, *_range_of("actuator_ctrlrange"))
+
+# The peak force of a muscle, and the figure from which MuJoCo takes it where it is negative. Both
+# stand twice, for the active and the passive force.
+_MUSCLE_FORCE = tuple(
+    Place(field, axis, 1.0) for field in ("actuator_gainprm", "actuator_biasprm") for axis in (2, 3)
 )
 
 
@@ -303,7 +313,7 @@ def _limit_places(
         return elements, _MOTOR_RANGES
     if isinstance(actuator, BuiltinMuscleActuator):
         return elements, _MUSCLE_FORCE
-    raise TypeError(_refusal("effort_limits", actuator, "every kind that mjlab.actuator has"))
+    raise WrongTypeError(_refusal("effort_limits", actuator, "every kind that mjlab.actuator has"))
 
 
 _FORCE_LIMITED = (
@@ -324,10 +334,16 @@ _FOLLOWING = (
 def _xml_effort_places(env: ManagerBasedRlEnv, selected: SelectedActuator) -> tuple[Place, ...]:
     """Return the places for XML actuators driven by effort; refuse where no place has an effect."""
     model, ids = env.sim.mj_model, selected.elements[0].tolist()
-    muscles = [model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_MUSCLE for i in ids]
-    if all(muscles):
+    if (model.actuator_gaintype[ids] == mujoco.mjtGain.mjGAIN_MUSCLE).all():
         return _MUSCLE_FORCE
-    by_control = not any(muscles) and all(_is_motor(model, i) for i in ids)
+    # The force of a motor is its control times a gain.
+    motors = (
+        (model.actuator_gaintype[ids] == mujoco.mjtGain.mjGAIN_FIXED)
+        & (model.actuator_biastype[ids] == mujoco.mjtBias.mjBIAS_NONE)
+        & np.isin(model.actuator_dyntype[ids], _FOLLOWING)
+        & (model.actuator_gainprm[ids, 0] != 0.0)
+    )
+    by_control = bool(motors.all())
     idle = [
         selected.actuator.target_names[target]
         for i, target in zip(ids, selected.targets.tolist(), strict=True)
@@ -337,22 +353,12 @@ def _xml_effort_places(env: ManagerBasedRlEnv, selected: SelectedActuator) -> tu
         )
     ]
     if idle:
-        raise TypeError(
+        raise WrongTypeError(
             f"effort_limits: the XML actuators on {idle} have no effort limit that could be "
             f"written. Give them a forcerange{' or a ctrlrange' if by_control else ''} in the XML, "
             "or select others by name; motors and muscles have to be selected by one event each."
         )
     return _MOTOR_RANGES if by_control else _FORCE_RANGE
-
-
-def _is_motor(model: mujoco.MjModel, i: int) -> bool:
-    """Return whether the force of an actuator is its control times a gain."""
-    return (
-        model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
-        and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
-        and int(model.actuator_dyntype[i]) in _FOLLOWING
-        and model.actuator_gainprm[i, 0] != 0.0
-    )
 
 
 def _reads(actuator: Actuator, command: CommandField, builtin: type[Actuator]) -> bool:
@@ -370,6 +376,9 @@ def _refusal(function: str, actuator: Actuator, supported: str) -> str:
         f"{function}: the actuators {list(actuator.target_names)} are of kind {kind}, which it "
         f"cannot randomize. Supported: {supported}. Select others by name."
     )
+
+
+# Writing.
 
 
 def _scale_or_abs(operation: Operation | str, function: str) -> Operation:
@@ -432,25 +441,6 @@ def _set_dc_motor_gains(
         model_field(env, "actuator_gainprm")[selected.rows[:, None], columns[None, :], axis] = (
             values
         )
-
-
-def _set_ideal_gains(
-    selected: SelectedActuator, op: Operation, kp: torch.Tensor, kd: torch.Tensor
-) -> None:
-    actuator = selected.actuator
-    assert isinstance(actuator, IdealPdActuator)
-    actuator.set_gains(
-        selected.rows,
-        kp=_merged(selected, actuator.stiffness, actuator.default_stiffness, op, kp),
-        kd=_merged(selected, actuator.damping, actuator.default_damping, op, kd),
-    )
-
-
-def _set_ideal_limits(selected: SelectedActuator, op: Operation, limits: torch.Tensor) -> None:
-    actuator = selected.actuator
-    assert isinstance(actuator, IdealPdActuator)
-    merged = _merged(selected, actuator.force_limit, actuator.default_force_limit, op, limits)
-    actuator.set_effort_limit(selected.rows, merged)
 
 
 def _merged(

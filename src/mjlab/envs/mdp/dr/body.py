@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+import warnings
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from mjlab.compat import older_names
 from mjlab.envs.mdp.dr._core import (
     BODY,
     ROBOT,
@@ -25,10 +25,64 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.managers.scene_entity_config import SceneEntityCfg
 
+__all__ = [
+    "body_com_offset",
+    "body_ipos",
+    "body_mass",
+    "body_pos",
+    "body_quat",
+    "pseudo_inertia",
+]
 
-# MERGED mjlab.envs.mdp.dr.body: Physically consistent randomization of mass, centre of mass and inertia together.
+
+def warn_mass_without_inertia(selection: Selection) -> None:
+    """Warn that a body whose mass changes keeps its inertia."""
+    warnings.warn(
+        "dr.body_mass changes masses and leaves inertias as they are. "
+        "Use dr.pseudo_inertia with alpha_range to scale both consistently.",
+        UserWarning,
+        stacklevel=4,
+    )
+
+
+body_mass = field_term(
+    __name__,
+    "body_mass",
+    BODY,
+    "Randomize body masses (kg). The inertia stays; `pseudo_inertia` scales both.",
+    operation="scale",
+    recompute=RecomputeLevel.set_const,
+    before=warn_mass_without_inertia,
+)
+body_com_offset = body_ipos = field_term(
+    __name__,
+    "body_com_offset",
+    BODY,
+    "Randomize centres of mass: offsets x, y, z (m) in the body frame.",
+    field="body_ipos",
+    operation="add",
+    recompute=RecomputeLevel.set_const,
+)
+body_pos = field_term(
+    __name__,
+    "body_pos",
+    BODY,
+    "Randomize body positions x, y, z (m) in the parent frame.",
+    operation="add",
+    recompute=RecomputeLevel.set_const_0,
+)
+body_quat = rotation_term(
+    __name__,
+    "body_quat",
+    BODY,
+    "Perturb body orientations in the parent frame.",
+    recompute=RecomputeLevel.set_const_0,
+)
+
+# Mass, centre of mass and inertia together.
 
 _FIELDS = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
+_PARAMETERS = ("alpha", "d1", "d2", "d3", "s12", "s13", "s23", "t1", "t2", "t3")
 
 
 class Inertial(NamedTuple):
@@ -95,20 +149,15 @@ def pseudo_inertia(
     ranges = (alpha_range, *d_ranges, s12_range, s13_range, s23_range, *t_ranges)
     bodies = select(env, env_ids, asset_cfg, BODY)
     default = _default_pseudo_inertia(bodies)
-    parameters = [_draw(dist, bounds, bodies, k) for k, bounds in enumerate(ranges)]
+    parameters = []
+    for name, given in zip(_PARAMETERS, ranges, strict=True):
+        bounds = read_bounds(given, f"pseudo_inertia: {name}_range")
+        parameters.append(draw(dist, bounds, bodies.shape, env.device).double())
     transform = _transform(parameters)
     perturbed = transform @ default @ transform.transpose(-1, -2)
     new = inertial_from_pseudo_inertia(perturbed)
     for field, value in zip(_FIELDS, new, strict=True):
         model_field(env, field)[bodies.index] = value.float()
-
-
-_PARAMETERS = ("alpha", "d1", "d2", "d3", "s12", "s13", "s23", "t1", "t2", "t3")
-
-
-def _draw(dist: Distribution, bounds: Any, bodies: Selection, k: int) -> torch.Tensor:
-    pair = read_bounds(bounds, f"pseudo_inertia: {_PARAMETERS[k]}_range")
-    return draw(dist, pair, bodies.shape, bodies.env.device).double()
 
 
 def _default_pseudo_inertia(bodies: Selection) -> torch.Tensor:
@@ -187,21 +236,3 @@ def _trace_identity(matrix: torch.Tensor) -> torch.Tensor:
     """Return tr(M) 1."""
     trace = matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
     return trace[..., None, None] * torch.eye(3, dtype=matrix.dtype, device=matrix.device)
-
-
-__all__ = [
-    "body_com_offset",
-    "body_ipos",
-    "body_mass",
-    "body_pos",
-    "body_quat",
-    "pseudo_inertia",
-]
-body_com_offset = field_term("body_com_offset")
-body_mass = field_term("body_mass")
-body_pos = field_term("body_pos")
-body_quat = rotation_term("body_quat")
-
-# MuJoCo's own name of the field.
-body_ipos = body_com_offset
-__getattr__ = older_names(__name__)

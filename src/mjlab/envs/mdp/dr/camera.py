@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import mujoco
+
 from mjlab.envs.mdp.dr._core import CAMERA, ROBOT, field_term, rotation_term, targets_of
-from mjlab.envs.mdp.dr._hooks import require_fovy_cameras
 from mjlab.managers.term_checks import checked_when_built
 
 if TYPE_CHECKING:
@@ -13,15 +14,52 @@ if TYPE_CHECKING:
     from mjlab.envs.mdp.dr._types import Ranges
     from mjlab.managers.scene_entity_config import SceneEntityCfg
 
+__all__ = ["cam_fovy", "cam_intrinsic", "cam_pos", "cam_quat"]
+
+cam_intrinsic = field_term(
+    __name__,
+    "cam_intrinsic",
+    CAMERA,
+    "Randomize camera intrinsics: focal lengths x, y and principal point x, y (m).",
+)
+cam_pos = field_term(
+    __name__,
+    "cam_pos",
+    CAMERA,
+    "Randomize camera positions x, y, z (m) in the body frame. Moves cameras of mode fixed only.",
+)
+cam_quat = rotation_term(
+    __name__, "cam_quat", CAMERA, "Perturb camera orientations in the body frame."
+)
+
 
 def _check_cam_fovy(
     env: ManagerBasedRlEnv, ranges: Ranges, asset_cfg: SceneEntityCfg = ROBOT, **_: Any
 ) -> None:
+    """Raise `ValueError` if a selected camera has a sensor, because of which fovy is not read."""
+    model = env.sim.mj_model
     for selection in targets_of(env, ranges, asset_cfg, CAMERA):
-        require_fovy_cameras(selection)
+        # Parallel rays have no focal length: there fovy is the height of the image.
+        refused = [
+            name
+            for name, camera in zip(selection.names, selection.columns.tolist(), strict=True)
+            if model.cam_sensorsize[camera, 1] > 0.0
+            and model.cam_projection[camera] == mujoco.mjtProjection.mjPROJ_PERSPECTIVE
+        ]
+        if refused:
+            raise ValueError(
+                f"cam_fovy: these cameras have a focal length and a sensor size, so that their "
+                f"field of view is not read: {refused}. Use dr.cam_intrinsic for them, or select "
+                "others (camera_names of the SceneEntityCfg)."
+            )
 
 
-cam_fovy = checked_when_built(_check_cam_fovy)(field_term("cam_fovy"))
-cam_intrinsic = field_term("cam_intrinsic")
-cam_pos = field_term("cam_pos")
-cam_quat = rotation_term("cam_quat")
+cam_fovy = checked_when_built(_check_cam_fovy)(
+    field_term(
+        __name__,
+        "cam_fovy",
+        CAMERA,
+        "Randomize vertical fields of view (degrees). Cameras with a focal length and a sensor "
+        "size do not read it, and are refused when the term is built: see `cam_intrinsic`.",
+    )
+)

@@ -2,13 +2,40 @@
 
 from __future__ import annotations
 
-from mjlab.envs.mdp.dr._core import field_term
+from mjlab.envs.mdp.dr._core import LIGHT, field_term
 
-light_ambient = field_term("light_ambient")
-light_attenuation = field_term("light_attenuation")
-light_cutoff = field_term("light_cutoff")
-light_diffuse = field_term("light_diffuse")
-light_dir = field_term("light_dir")
-light_exponent = field_term("light_exponent")
-light_pos = field_term("light_pos")
-light_specular = field_term("light_specular")
+__all__ = [
+    "light_ambient",
+    "light_attenuation",
+    "light_cutoff",
+    "light_diffuse",
+    "light_dir",
+    "light_exponent",
+    "light_pos",
+    "light_specular",
+]
+
+light_ambient = field_term(__name__, "light_ambient", LIGHT, "Randomize ambient colours r, g, b.")
+light_attenuation = field_term(
+    __name__,
+    "light_attenuation",
+    LIGHT,
+    "Randomize attenuation: constant, linear and quadratic coefficient.",
+)
+light_cutoff = field_term(__name__, "light_cutoff", LIGHT, "Randomize spotlight cutoffs (degrees).")
+light_diffuse = field_term(__name__, "light_diffuse", LIGHT, "Randomize diffuse colours r, g, b.")
+light_dir = field_term(
+    __name__,
+    "light_dir",
+    LIGHT,
+    "Randomize light directions x, y, z (body frame), which are then brought to length 1. "
+    "Axes that are not targeted start from the default direction.",
+    unit=True,
+)
+light_exponent = field_term(__name__, "light_exponent", LIGHT, "Randomize spotlight exponents.")
+light_pos = field_term(
+    __name__, "light_pos", LIGHT, "Randomize light positions x, y, z (m), body frame."
+)
+light_specular = field_term(
+    __name__, "light_specular", LIGHT, "Randomize specular colours r, g, b."
+)

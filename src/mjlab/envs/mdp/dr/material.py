@@ -14,6 +14,7 @@ from mjlab.envs.mdp.dr._core import (
     select,
 )
 from mjlab.managers.event_manager import requires_model_fields
+from mjlab.utils.errors import check_in_range
 
 if TYPE_CHECKING:
     import torch
@@ -21,11 +22,25 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.managers.scene_entity_config import SceneEntityCfg
 
-mat_emission = field_term("mat_emission")
-mat_rgba = field_term("mat_rgba")
-mat_shininess = field_term("mat_shininess")
-mat_specular = field_term("mat_specular")
-mat_texrepeat = field_term("mat_texrepeat")
+__all__ = [
+    "mat_emission",
+    "mat_rgba",
+    "mat_shininess",
+    "mat_specular",
+    "mat_texid",
+    "mat_texrepeat",
+]
+
+mat_emission = field_term(__name__, "mat_emission", MATERIAL, "Randomize material emission.")
+mat_rgba = field_term(
+    __name__,
+    "mat_rgba",
+    MATERIAL,
+    "Randomize material colours r, g, b, a in [0, 1]; a texture is multiplied by it.",
+)
+mat_shininess = field_term(__name__, "mat_shininess", MATERIAL, "Randomize shininess in [0, 1].")
+mat_specular = field_term(__name__, "mat_specular", MATERIAL, "Randomize specularity in [0, 1].")
+mat_texrepeat = field_term(__name__, "mat_texrepeat", MATERIAL, "Randomize texture repeats x, y.")
 
 
 @requires_model_fields("mat_texid")
@@ -51,8 +66,5 @@ def mat_texid(
     materials = select(env, env_ids, asset_cfg, MATERIAL)
     textures = select(env, env_ids, asset_cfg, TEXTURE)
     field = model_field(env, "mat_texid")
-    if not 0 <= role < field.shape[-1]:
-        raise ValueError(
-            f"mat_texid: role {role} does not exist; it is 0 to {field.shape[-1] - 1}."
-        )
+    check_in_range("mat_texid role", role, 0, field.shape[-1] - 1)
     field[(*materials.index, role)] = choose_ids(materials, textures, shared_random)

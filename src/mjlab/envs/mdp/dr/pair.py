@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mjlab.envs.mdp.dr._core import ROBOT, model_field, randomize
-from mjlab.envs.mdp.dr._table import TABLE
-from mjlab.managers.event_manager import requires_model_fields
+from mjlab.envs.mdp.dr._core import PAIR, ROBOT, FieldRow, model_field, randomize, writes
 
 if TYPE_CHECKING:
     import torch
@@ -15,8 +13,12 @@ if TYPE_CHECKING:
     from mjlab.envs.mdp.dr._types import Distribution, Operation, Ranges
     from mjlab.managers.scene_entity_config import SceneEntityCfg
 
+__all__ = ["pair_friction"]
 
-@requires_model_fields(*TABLE["pair_friction"].fields)
+_ROW = FieldRow("pair_friction", "pair_friction", PAIR, default_axes=(0,))
+
+
+@writes(_ROW)
 def pair_friction(
     env: ManagerBasedRlEnv,
     env_ids: torch.Tensor | None,
@@ -38,15 +40,7 @@ def pair_friction(
             roll 2 follows roll 1 if a roll axis was randomized.
     """
     written = randomize(
-        TABLE["pair_friction"],
-        env,
-        env_ids,
-        ranges,
-        asset_cfg,
-        distribution,
-        operation,
-        axes,
-        shared_random,
+        _ROW, env, env_ids, ranges, asset_cfg, distribution, operation, axes, shared_random
     )
     if not isotropic:
         return

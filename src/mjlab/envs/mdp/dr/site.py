@@ -2,7 +2,23 @@
 
 from __future__ import annotations
 
-from mjlab.envs.mdp.dr._core import field_term, rotation_term
+from mjlab.envs.mdp.dr._core import SITE, field_term, rotation_term
+from mjlab.managers.event_manager import RecomputeLevel
 
-site_pos = field_term("site_pos")
-site_quat = rotation_term("site_quat")
+__all__ = ["site_pos", "site_quat"]
+
+# Spatial tendons run through sites, and actuators act at them.
+site_pos = field_term(
+    __name__,
+    "site_pos",
+    SITE,
+    "Randomize site positions x, y, z (m) in the body frame.",
+    recompute=RecomputeLevel.set_const_0,
+)
+site_quat = rotation_term(
+    __name__,
+    "site_quat",
+    SITE,
+    "Perturb site orientations in the body frame.",
+    recompute=RecomputeLevel.set_const_0,
+)

@@ -11,20 +11,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mjlab.scripts.cli import UserError, run_command, task_and_flags, task_usage
-from mjlab.scripts.evaluate_run import EvaluateConfig, run_evaluate
+from mjlab.scripts.cli import Command, run_command, run_subcommand
+from mjlab.scripts.evaluate import EvaluateConfig, run_evaluate
 from mjlab.scripts.policy import parse_policy_flags
 from mjlab.tasks.tracking.mdp.metrics import TRACKING_ERRORS
+from mjlab.utils.errors import UserError
 
 _NAME = "python -m mjlab.tasks.tracking.scripts.evaluate"
-_USAGE = task_usage(
+_COMMAND = Command(
     _NAME,
+    "Policies",
+    "Score a policy that tracks motions.",
+    "mjlab.tasks.tracking.scripts.evaluate:command",
+    "TASK",
     "Let each environment play a motion once, and print the share of episodes that no termination "
-    "ended, and the mean errors.",
-    [
+    "ended,\nand the mean errors.",
+    (
         f"{_NAME} Mjlab-Tracking-Flat-Unitree-G1 --wandb-run-path org/project/run",
         f"{_NAME} Mjlab-Tracking-Flat-Unitree-G1 --num-envs 200 --output-file figures.json",
-    ],
+    ),
 )
 
 
@@ -74,15 +79,16 @@ def run_evaluate_tracking(task: str, cfg: EvaluateTrackingConfig) -> dict[str, f
     return means
 
 
-def _command(argv: list[str]) -> None:
-    task, flags = task_and_flags(argv, _USAGE)
-    cfg = parse_policy_flags(EvaluateTrackingConfig, flags, task, _NAME, purpose="evaluate")
+def command(argv: list[str], prog: str) -> None:
+    """Run the command."""
+    task, *flags = argv
+    cfg = parse_policy_flags(EvaluateTrackingConfig, flags, task, prog, purpose="evaluate")
     run_evaluate_tracking(task, cfg)
 
 
 def main() -> None:
     """Entry point."""
-    run_command(_command)
+    run_command(lambda argv: run_subcommand(_COMMAND, argv, _NAME))
 
 
 if __name__ == "__main__":

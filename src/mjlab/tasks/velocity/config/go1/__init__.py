@@ -23,12 +23,10 @@ _ENV_CFGS = "mjlab.tasks.velocity.config.go1.env_cfgs"
 _RL_CFG = "mjlab.tasks.velocity.config.go1.rl_cfg"
 _RUNNER = "mjlab.tasks.velocity.rl"
 
-_PROFILES = "mjlab.tasks.velocity.config"
-
 for _terrain in ("Flat", "Rough"):
-    _profiles = {"cpu": f"{_PROFILES}.cpu_profile:cpu"}
+    _profiles = {"cpu": "mjlab.tasks.velocity.rl.ppo:cpu"}
     if _terrain == "Rough":
-        _profiles["blind"] = f"{_PROFILES}.blind_profile:blind"
+        _profiles["blind"] = "mjlab.tasks.velocity.config.blind_profile:blind"
     register_mjlab_task(
         task_id=f"Mjlab-Velocity-{_terrain}-Unitree-Go1",
         env_cfg=f"{_ENV_CFGS}:unitree_go1_{_terrain.lower()}_env_cfg",

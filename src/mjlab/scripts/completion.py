@@ -1,0 +1,85 @@
+"""Shell completion of commands and task names: `eval "$(mjlab completion bash)"`."""
+
+from __future__ import annotations
+
+from mjlab.utils.errors import BadCallError
+
+_USAGE = """\
+usage: mjlab completion bash|zsh|fish
+
+Print a script that completes subcommands and task names. Add one of these lines to the start-up file
+of the shell:
+
+    eval "$(mjlab completion bash)"        # ~/.bashrc
+    eval "$(mjlab completion zsh)"         # ~/.zshrc, after compinit
+    mjlab completion fish | source         # ~/.config/fish/config.fish"""
+
+# The shell asks `mjlab completion --candidates WORD...`; the last word is the one to complete. Words
+# of `train`, `play` and so on are those of `mjlab train` and `mjlab play`.
+_BASH = """\
+_mjlab_complete() {
+    local words=("${COMP_WORDS[@]:1:COMP_CWORD}")
+    [ "${COMP_WORDS[0]##*/}" = mjlab ] || words=("${COMP_WORDS[0]##*/}" "${words[@]}")
+    COMPREPLY=($(mjlab completion --candidates "${words[@]}" 2>/dev/null))
+}
+complete -o default -F _mjlab_complete """
+
+_ZSH = "autoload -Uz bashcompinit && bashcompinit\n" + _BASH
+
+_FISH = """\
+function _mjlab_complete
+    set -l words (commandline -opc) (commandline -ct)
+    set -l name (basename $words[1])
+    test $name = mjlab; and set words $words[2..]; or set words $name $words[2..]
+    mjlab completion --candidates $words 2>/dev/null
+end
+for name in """
+
+
+def candidates(words: list[str]) -> list[str]:
+    """Return the completions of the last of `words`, which follow `mjlab` on a command line."""
+    from mjlab.scripts.cli import COMMANDS
+
+    *before, partial = words or [""]
+    if not before:
+        names = [command.name for command in COMMANDS]
+    elif len(before) == 1 and _takes_task(before[0]):
+        from mjlab.tasks.registry import list_tasks
+
+        names = list_tasks()
+    else:
+        return []
+    return [name for name in names if name.startswith(partial)]
+
+
+def _takes_task(name: str) -> bool:
+    from mjlab.scripts.cli import COMMANDS
+
+    return any(c.name == name and c.argument in ("TASK", "TARGET") for c in COMMANDS)
+
+
+def command(argv: list[str], prog: str) -> None:
+    """Run `mjlab completion`."""
+    from mjlab.scripts.cli import ALIASES
+
+    names = " ".join(["mjlab", *ALIASES])
+    scripts = {
+        "bash": _BASH + names,
+        "zsh": _ZSH + names,
+        "fish": f"{_FISH}{names}\n    complete -c $name -f -a '(_mjlab_complete)'\nend",
+    }
+    if argv[:1] == ["--candidates"]:
+        print("\n".join(candidates(argv[1:])))
+    elif not argv or argv[0] in ("-h", "--help"):
+        print(_USAGE)
+    elif argv[0] in scripts and len(argv) == 1:
+        print(scripts[argv[0]])
+    else:
+        raise BadCallError(f"{prog}: expected one of {', '.join(scripts)}, got {' '.join(argv)!r}.")
+
+
+def main() -> None:
+    """Entry point of `python -m mjlab.scripts.completion`."""
+    from mjlab.scripts.cli import run_alias
+
+    run_alias("completion")

@@ -1,0 +1,106 @@
+"""Environments and runners of a task, as commands build them."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+from collections.abc import Generator
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
+from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
+from mjlab.rl.learners import learner_of
+from mjlab.scripts.flags import options_of
+from mjlab.tasks.registry import load_rl_cfg, load_runner_cls, task_source
+from mjlab.utils.processes import ProcessRank, cores_per_process
+from mjlab.utils.random import seed_rng
+from mjlab.utils.torch import prepare_torch
+from mjlab.utils.wandb import add_wandb_tags
+
+if TYPE_CHECKING:
+    from mjlab.scripts.train_config import TrainConfig
+
+
+def make_env(
+    task: str,
+    cfg: ManagerBasedRlEnvCfg,
+    device: str,
+    num_envs: int | None = None,
+    engine: Any = None,
+    *,
+    seed: int | None = None,
+    render_mode: str | None = None,
+    profile: str | None = None,
+) -> Any:
+    """Return the wrapped environment of `cfg`; what is None is left as `cfg` has it.
+
+    Actions are clipped as the learner's config of the task says, under `profile`.
+    """
+    prepare_torch(device)
+    cfg = copy.deepcopy(cfg)
+    cfg.seed = cfg.seed if seed is None else seed
+    if num_envs is not None:
+        cfg.scene.num_envs = num_envs
+    if engine is not None:
+        cfg.sim.engine = engine
+    env = ManagerBasedRlEnv(cfg, device=device, render_mode=render_mode)
+    clip_actions = load_rl_cfg(task, profile=profile).clip_actions
+    return RslRlVecEnvWrapper(env, clip_actions=clip_actions)
+
+
+def training_env(cfg: TrainConfig, device: str, run_dir: Path, rank: ProcessRank) -> Any:
+    """Return the wrapped environment to train in; `--video` records it into `run_dir`."""
+    records = cfg.video and rank.is_first
+    with _core_for_learner(cfg, device, rank):
+        env: Any = ManagerBasedRlEnv(
+            cfg.env, device=device, render_mode="rgb_array" if records else None
+        )
+    if records:
+        from mjlab.utils.wrappers import VideoRecorder
+
+        env = VideoRecorder(
+            env,
+            video_folder=run_dir / "videos" / "train",
+            step_trigger=lambda step: step % cfg.video_interval == 0,
+            video_length=cfg.video_length,
+            disable_logger=True,
+        )
+    return RslRlVecEnvWrapper(env, clip_actions=cfg.agent.clip_actions)
+
+
+@contextlib.contextmanager
+def _core_for_learner(cfg: TrainConfig, device: str, rank: ProcessRank) -> Generator[None]:
+    """Let the physics built within the block leave one core to SAC, which learns at the same time.
+
+    The config is unchanged afterwards, so that evaluations, during which nothing is learned, have all
+    cores.
+    """
+    sim = cfg.env.sim
+    if sim.num_threads != 0 or learner_of(cfg.agent) != "sac":
+        yield
+        return
+    if device == "cpu" and rank.is_alone:
+        sim.num_threads = max(1, min(cores_per_process() - 1, cfg.env.scene.num_envs))
+    try:
+        yield
+    finally:
+        sim.num_threads = 0
+
+
+def training_runner(
+    task: str, cfg: TrainConfig, env: Any, run_dir: Path, device: str
+) -> MjlabOnPolicyRunner:
+    """Return the runner of `task`, with new networks."""
+    runner_cls: Any = load_runner_cls(task) or MjlabOnPolicyRunner
+    if cfg.agent.logger == "wandb":
+        add_wandb_tags(cfg.agent.wandb_tags)
+    # Seeded again, so that the initial networks depend on the seed alone and not on how many random
+    # numbers the environment drew while it was built.
+    seed_rng(cfg.agent.seed)
+    further = options_of(task, cfg).runner_kwargs()
+    runner = runner_cls(env, asdict(cfg.agent), str(run_dir), device, **further)
+    if (source := task_source(task)) is not None and hasattr(runner, "add_git_repo_to_log"):
+        runner.add_git_repo_to_log(source)
+    return runner

@@ -1,0 +1,138 @@
+"""Starting several processes: their numbers, their signals, their end, their output."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from mjlab.rl import distributed
+from mjlab.rl.distributed import launch_workers, log_file, output_of
+from mjlab.utils.errors import UserError
+from mjlab.utils.processes import ProcessRank
+
+PROGRAM = "import os, pathlib, signal, sys, time\nrank = os.environ['RANK']\n"
+
+
+def launch(code: str, count: int = 2, **environment: str) -> None:
+    launch_workers([sys.executable, "-c", PROGRAM + code], count, environment)
+
+
+def test_every_process_gets_a_number_and_the_same_store(tmp_path):
+    names = ["RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE", "MJLAB_PROCESS_STORE", "EXTRA"]
+    code = f"text = ' '.join(os.environ[name] for name in {names})\n"
+    launch(code + f"pathlib.Path({str(tmp_path)!r}, rank).write_text(text)", 3, EXTRA="more")
+    words = [(tmp_path / str(rank)).read_text().split() for rank in range(3)]
+    assert [[*word[:4], word[5]] for word in words] == [
+        [str(rank), str(rank), "3", "3", "more"] for rank in range(3)
+    ]
+    assert len({word[4] for word in words}) == 1
+    assert words[0][4].startswith("127.0.0.1:")
+
+
+def test_processes_that_are_many_get_few_threads_each(tmp_path, monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(distributed, "cores_per_process", lambda: 7)
+    code = f"pathlib.Path({str(tmp_path)!r}, rank).write_text(os.environ['OMP_NUM_THREADS'])"
+    launch(code, 2)
+    assert (tmp_path / "1").read_text() == "3"
+
+
+@pytest.mark.parametrize(
+    ("end", "how"),
+    [("sys.exit(5)", "failed with status 5"), ("os.kill(os.getpid(), 9)", "was ended by SIGKILL")],
+)
+def test_a_process_that_fails_ends_the_others_and_is_named(monkeypatch, end, how):
+    monkeypatch.setattr(distributed, "_PATIENCE", 0.3)
+    begin = time.monotonic()
+    with pytest.raises(UserError, match=f"Process 1 of 2 {how}"):
+        launch(f"if rank == '1': {end}\ntime.sleep(60)")
+    assert time.monotonic() - begin < 30
+
+
+def test_a_process_that_gave_up_because_of_another_is_not_the_one_named():
+    with pytest.raises(UserError, match="Process 1 of 2 failed with status 1"):
+        launch("if rank == '1': time.sleep(0.5); sys.exit(1)\nsys.exit(3)")
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_goes_to_every_process_once_and_all_are_waited_for(tmp_path, name):
+    child = (
+        f"{PROGRAM}folder = pathlib.Path({str(tmp_path)!r})\n"
+        "def save(*_):\n"
+        "    with (folder / f'saved_{rank}').open('a') as file: file.write('x')\n"
+        "    time.sleep(0.4)\n    (folder / f'done_{rank}').touch()\n    os._exit(0)\n"
+        f"signal.signal(signal.{name}, save)\n"
+        "(folder / f'ready_{rank}').touch()\ntime.sleep(30)\n"
+    )
+    parent = (
+        "import sys\nfrom mjlab.rl.distributed import launch_workers\n"
+        f"launch_workers([sys.executable, '-c', {child!r}], 2)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", parent])
+    deadline = time.monotonic() + 60
+    while len(list(tmp_path.glob("ready_*"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(getattr(signal, name))
+    assert process.wait(timeout=30) == 0
+    assert sorted(path.name for path in tmp_path.glob("done_*")) == ["done_0", "done_1"]
+    assert (tmp_path / "saved_0").read_text() == "x"
+
+
+def test_a_killed_launcher_ends_its_workers(tmp_path):
+    child = (
+        f"{PROGRAM}from mjlab.utils.processes import end_with_launcher\n"
+        f"folder = pathlib.Path({str(tmp_path)!r})\n"
+        "def save(*_):\n    (folder / f'saved_{rank}').touch()\n    os._exit(0)\n"
+        "signal.signal(signal.SIGTERM, save)\nend_with_launcher()\n"
+        "(folder / f'ready_{rank}').touch()\ntime.sleep(30)\n"
+    )
+    parent = (
+        "import sys\nfrom mjlab.rl.distributed import launch_workers\n"
+        f"launch_workers([sys.executable, '-c', {child!r}], 2)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", parent])
+    deadline = time.monotonic() + 60
+    while len(list(tmp_path.glob("ready_*"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 20
+    while len(list(tmp_path.glob("saved_*"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert len(list(tmp_path.glob("saved_*"))) == 2
+
+
+def test_what_other_processes_print_goes_to_a_file(tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("TORCHRUNX_LOG_DIR", raising=False)
+    rank = ProcessRank(1, 2, 1, 2)
+    path = log_file(rank, None, tmp_path)
+    assert path == tmp_path / "torchrunx" / "rank_1.log"
+    with output_of(rank) as output:
+        assert output is not None
+        print("before")
+        output.keep_in(path)
+        print("after", file=sys.stderr)
+    print("later")
+    assert path.read_text() == "before\nafter\n"
+    assert capsys.readouterr() == ("later\n", "")
+    with output_of(rank) as output:
+        assert output is not None
+        output.keep_in(None)
+        print("lost")
+    with output_of(ProcessRank(0, 2, 0, 2)) as output:
+        assert output is None
+        print("seen")
+    assert capsys.readouterr() == ("seen\n", "")
+
+
+def test_the_folder_of_that_file_can_be_chosen(tmp_path, monkeypatch):
+    rank = ProcessRank(2, 4, 2, 4)
+    monkeypatch.delenv("TORCHRUNX_LOG_DIR", raising=False)
+    assert log_file(rank, str(tmp_path / "mine"), tmp_path) == tmp_path / "mine" / "rank_2.log"
+    assert log_file(rank, "", tmp_path) is None
+    monkeypatch.setenv("TORCHRUNX_LOG_DIR", str(tmp_path / "variable"))
+    assert log_file(rank, "", tmp_path) == tmp_path / "variable" / "rank_2.log"

@@ -1,0 +1,28 @@
+"""The torch device of a command."""
+
+from __future__ import annotations
+
+import pytest
+
+from mjlab.scripts.devices import resolve_device
+from mjlab.utils.errors import UserError
+
+
+@pytest.mark.parametrize(("asked", "device"), [("cpu", "cpu"), ("cuda", "cuda:0")])
+def test_the_device_is_the_one_asked_for(asked, device, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    assert resolve_device(asked) == device
+
+
+@pytest.mark.parametrize(("gpu", "device"), [(False, "cpu"), (True, "cuda:0")])
+def test_without_a_wish_the_device_is_a_gpu_where_there_is_one(gpu, device, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: gpu)
+    assert resolve_device(None) == device
+
+
+def test_a_device_that_cannot_be_used_is_refused_with_what_to_do(monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(UserError, match=r"--device cuda:1 .* no CUDA GPU .* --device cpu"):
+        resolve_device("cuda:1")
+    with pytest.raises(UserError, match=r"'gpu' is not a device. Use cpu, cuda"):
+        resolve_device("gpu")

@@ -1,0 +1,109 @@
+"""Flags of `train` that would be ignored, or train nothing: one line, and nothing is built."""
+
+from __future__ import annotations
+
+import pytest
+from commands import SMALL, TASK
+
+from mjlab.tasks import registry
+
+
+@pytest.fixture
+def no_gpu(monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (["--agent.class-name", "Foo"], "'Foo'"),
+        (["--agent.class_name=Foo"], "'Foo'"),
+        (["--wandb-run-path", "me/project/abc"], "--agent.resume True"),
+        (["--agent.load-run", "2026.*"], "--agent.resume True"),
+        (["--agent.load-checkpoint", "model_1.pt"], "--agent.resume True"),
+        (["--wandb-checkpoint-name", "model_1.pt"], "--wandb-run-path"),
+        (["--gpu-ids", "[0]", "--device", "cpu"], "'cpu'"),
+        (["--gpu-ids", "all"], "none is visible"),
+    ],
+)
+@pytest.mark.usefixtures("no_gpu")
+def test_a_typed_flag_that_would_be_ignored_ends_with_status_2(run, tmp_path, flags, named):
+    outcome = run("train", TASK, "--log-root", str(tmp_path / "logs"), *flags)
+    assert outcome.status == 2
+    assert named in outcome.message
+    assert flags[0].partition("=")[0].replace("_", "-") in outcome.message
+    assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize("flag", ["--agent.seed", "--agent.run-name"])
+def test_train_seeds_refuses_what_it_sets_itself(run, flag):
+    outcome = run("train_seeds", TASK, "--seeds", "1", flag, "3")
+    assert outcome.status == 2
+    assert flag in outcome.message
+
+
+@pytest.mark.usefixtures("no_gpu")
+def test_defaults_that_have_no_effect_are_silent(run, tmp_path):
+    flags = ("--log-root", str(tmp_path), "--agent.max-iterations", "1")
+    outcome = run("train", TASK, *SMALL, *flags, "--agent.class-name", "OnPolicyRunner")
+    assert outcome.status == 0
+    assert "gpu-ids" not in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("gamma", "nan"), ("learning-rate", "inf"), ("entropy-coef", "nan")]
+)
+def test_settings_that_are_not_finite_are_refused(run, tmp_path, name, value):
+    flag = f"--agent.algorithm.{name}"
+    outcome = run("train", TASK, *SMALL, "--log-root", str(tmp_path / "logs"), flag, value)
+    assert outcome.status == 1
+    assert f"{flag}: expected a finite number, got {value}" in outcome.message
+    assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("can't start new thread")])
+def test_too_little_memory_is_one_message(run, tmp_path, monkeypatch, error):
+    def build(*args):
+        raise error
+
+    monkeypatch.setattr("mjlab.scripts.train.training_env", build)
+    outcome = run("train", TASK, *SMALL, "--log-root", str(tmp_path))
+    assert outcome.status == 1
+    assert "Memory" in outcome.message
+    assert "Traceback" not in outcome.err
+
+
+def test_a_run_that_ends_before_it_learns_is_refused(run, tmp_path):
+    flags = ("--log-root", str(tmp_path), "--learner", "sac", "--agent.max-iterations", "1")
+    outcome = run("train", TASK, *SMALL, *flags, "--agent.algorithm.learning-starts", "9")
+    assert outcome.status == 1
+    assert "learning-starts: expected at most 8" in outcome.message
+
+
+@pytest.mark.parametrize(("learner", "is_told"), [("sac", True), ("ppo", False)])
+def test_a_profile_for_another_learner_is_told(run, tmp_path, monkeypatch, learner, is_told):
+    cfg = registry.load_env_cfg(TASK)
+    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))
+    registry.register_mjlab_task(
+        "Test-Profiled",
+        cfg,
+        rl_cfg=registry.load_rl_cfg(TASK),
+        profiles={"small": lambda env_cfg, rl_cfg: None},
+    )
+    flags = ("--log-root", str(tmp_path), "--profile", "small", "--learner", learner)
+    small = (*SMALL, "--agent.max-iterations", "2")
+    outcome = run("train", "Test-Profiled", *small, *flags)
+    assert outcome.status == 0, outcome.err
+    assert ("settings for the learner 'ppo'" in outcome.err) == is_told
+
+
+def test_a_message_of_a_damaged_file_is_cut_in_the_middle(run, monkeypatch):
+    def build(*args, **kwargs):
+        raise ValueError("begins " + "x" * 100_000 + " ends")
+
+    monkeypatch.setattr("mjlab.scripts.train.launch_training", build)
+    outcome = run("train", TASK, *SMALL)
+    assert outcome.status == 1
+    assert len(outcome.err) < 10_000
+    assert "begins" in outcome.message
+    assert "ends" in outcome.message

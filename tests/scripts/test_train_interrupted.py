@@ -1,0 +1,162 @@
+"""Runs that are ended from outside: what is on the disk then resumes as if nothing had happened."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from commands import SMALL, TASK
+
+from mjlab.rl.checkpoint import load_checkpoint
+from mjlab.scripts.run_folder import checkpoints_in, read_run_info
+
+PATIENCE = 60.0
+
+
+def endless_run(log_root: Path) -> list[str]:
+    command = [sys.executable, "-m", "mjlab.scripts.train", TASK, *SMALL]
+    return [*command, "--log-root", str(log_root), "--agent.max-iterations", "1000000"]
+
+
+def start_endless_run(log_root: Path) -> subprocess.Popen[str]:
+    # One thread, as in the runs that these are compared with.
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        endless_run(log_root),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=environment,
+    )
+
+
+def wait_for_checkpoint(log_root: Path, process: subprocess.Popen[str], name: str) -> None:
+    end = time.monotonic() + PATIENCE
+    while not list(log_root.glob(f"cartpole/*/{name}")):
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < end, f"no {name} after {PATIENCE} s"
+        time.sleep(0.01)
+
+
+def assert_resumes_exactly(train, log_root: Path, run_dir: Path, tmp_path: Path) -> None:
+    """Resume what is in `run_dir`, and compare with a run that was never ended."""
+    last = checkpoints_in(run_dir)[-1]
+    iterations = load_checkpoint(last)["iterations_finished"] + 2
+    resumed = train(log_root, iterations, "--agent.resume", "True")
+    straight = train(tmp_path / "straight", iterations)
+    name = f"model_{iterations - 1}.pt"
+    for model in ("actor_state_dict", "critic_state_dict"):
+        one = load_checkpoint(resumed / name)[model]
+        other = load_checkpoint(straight / name)[model]
+        assert one.keys() == other.keys()
+        assert [key for key in one if not torch.equal(one[key], other[key])] == []
+
+
+def test_a_run_that_is_killed_resumes_from_its_last_checkpoint_bit_for_bit(train, tmp_path):
+    log_root = tmp_path / "logs"
+    process = start_endless_run(log_root)
+    wait_for_checkpoint(log_root, process, "model_1.pt")
+    process.kill()
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    (run_dir,) = (log_root / "cartpole").iterdir()
+    assert_resumes_exactly(train, log_root, run_dir, tmp_path)
+
+
+def test_sigterm_saves_exports_and_ends_with_status_0(train, tmp_path):
+    log_root = tmp_path / "logs"
+    process = start_endless_run(log_root)
+    wait_for_checkpoint(log_root, process, "model_0.pt")
+    process.terminate()
+    out = process.communicate(timeout=PATIENCE)[0]
+    assert process.returncode == 0, out
+    assert "SIGTERM: finishing this iteration, then saving" in out
+    assert "Training interrupted" in out
+    (run_dir,) = (log_root / "cartpole").iterdir()
+    info = read_run_info(run_dir)
+    assert info["ended"] == "interrupted"
+    assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"
+    assert list(run_dir.glob("*.onnx"))
+    assert_resumes_exactly(train, log_root, run_dir, tmp_path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
+def test_a_terminal_that_is_closed_leaves_a_checkpoint(tmp_path):
+    import pty
+
+    log_root = tmp_path / "logs"
+    child, terminal = pty.fork()
+    if child == 0:
+        os.execv(sys.executable, endless_run(log_root))
+    # What is not read from a terminal stops the one who writes.
+    reader = threading.Thread(target=read_until_closed, args=(terminal,), daemon=True)
+    reader.start()
+    end = time.monotonic() + PATIENCE
+    while not list(log_root.glob("cartpole/*/model_0.pt")) and time.monotonic() < end:
+        time.sleep(0.01)
+    os.kill(child, signal.SIGHUP)
+    os.close(terminal)
+    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    (run_dir,) = (log_root / "cartpole").iterdir()
+    info = read_run_info(run_dir)
+    assert (status, info["ended"]) == (0, "interrupted")
+    assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"
+
+
+def read_until_closed(terminal: int) -> None:
+    with contextlib.suppress(OSError):
+        while os.read(terminal, 4096):
+            pass
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_a_signal_while_building_leaves_no_folder(tmp_path, number):
+    # Building takes as long as the signal needs; the folder is there by then.
+    program = (
+        "import os, signal, sys, time\n"
+        "from mjlab.scripts import train\n"
+        "def build(*args):\n"
+        f"    os.kill(os.getpid(), {int(number)})\n"
+        "    time.sleep(30)\n"
+        "train.training_env = build\n"
+        "train.main()\n"
+    )
+    flags = [TASK, *SMALL, "--log-root", str(tmp_path)]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *flags],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert done.returncode == 128 + number
+    assert "Traceback" not in done.stderr
+    assert list((tmp_path / "cartpole").iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no signals to groups of processes")
+def test_a_signal_that_ends_the_reader_of_a_pipe_first_leaves_a_checkpoint(tmp_path):
+    log_root = tmp_path / "logs"
+    process = subprocess.Popen(
+        endless_run(log_root), stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    assert process.stdout is not None
+    end = time.monotonic() + PATIENCE
+    while not list(log_root.glob("cartpole/*/model_0.pt")) and time.monotonic() < end:
+        time.sleep(0.01)
+    # As `train | tee log`, when Ctrl-C ends `tee`.
+    process.stdout.close()
+    process.send_signal(signal.SIGINT)
+    process.wait(PATIENCE)
+    (run_dir,) = (log_root / "cartpole").iterdir()
+    info = read_run_info(run_dir)
+    assert info["ended"] == "interrupted"
+    assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"

@@ -1,0 +1,298 @@
+"""`--learner`: SAC in place of PPO, from the command line to the run folder and back."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import onnxruntime
+import pytest
+import torch
+import yaml
+from commands import TASK
+from process_runs import ProcessRun
+
+from mjlab.rl.config import RslRlOffPolicyRunnerCfg
+from mjlab.rl.learners import with_learner
+from mjlab.scripts import environments
+from mjlab.scripts.environments import make_env
+from mjlab.scripts.evaluate import EvaluateConfig
+from mjlab.scripts.live import Exchange, LiveJob, _env_to_show
+from mjlab.scripts.policy import _agent_cfg, env_cfg_of, load_policy
+from mjlab.scripts.run_folder import read_run_info, write_run_info
+from mjlab.scripts.train import TrainConfig, parse_train_flags
+from mjlab.tasks import registry
+from mjlab.utils.processes import ProcessRank
+
+SAC = (
+    "--learner", "sac", "--agent.algorithm.batch-size", "64", "--agent.algorithm.replay-steps", "9",
+    "--agent.algorithm.learning-starts", "2", "--agent.actor.hidden-dims", "(8,)",
+)  # fmt: skip
+OF_SAC = ("--agent.algorithm.batch-size", "32")
+
+
+@pytest.fixture(scope="module")
+def of_sac(train, tmp_path_factory) -> Path:
+    """Return the folder of a run of two iterations by SAC; not to be changed."""
+    return train(tmp_path_factory.mktemp("sac") / "logs", 2, *SAC)
+
+
+@pytest.fixture
+def first(of_sac, tmp_path) -> Path:
+    """Return a copy of it."""
+    return shutil.copytree(of_sac, tmp_path / "cartpole" / "2026-01-01_00-00-00")
+
+
+# Flags.
+
+
+def test_the_learner_decides_which_flags_there_are(capsys):
+    for learner in (["--learner", "sac"], ["--learner=sac"]):
+        agent: Any = parse_train_flags(TASK, [*OF_SAC, *learner], "train").agent
+        assert isinstance(agent, RslRlOffPolicyRunnerCfg)
+        assert agent.algorithm.batch_size == 32
+        assert agent.experiment_name == "cartpole"
+    assert parse_train_flags(TASK, ["--learner", "ppo"], "train").agent == (
+        TrainConfig.from_task(TASK).agent
+    )
+    with pytest.raises(SystemExit):
+        parse_train_flags(TASK, [*OF_SAC], "train")
+    assert "--agent.algorithm.batch-size" in capsys.readouterr().err
+
+
+def test_the_help_lists_the_flags_of_the_learner(run):
+    outcome = run("train", TASK, "--learner", "sac", "--help")
+    assert "--agent.algorithm.num-updates" in outcome.out
+    assert "num-mini-batches" not in outcome.out
+
+
+@pytest.mark.parametrize("script", ["train", "train_seeds"])
+def test_a_learner_that_does_not_exist_is_told_with_those_that_do(run, script):
+    outcome = run(script, TASK, "--learner", "td3")
+    assert outcome.status == 1
+    assert all(name in outcome.message for name in ("td3", "ppo", "sac", "distillation"))
+
+
+def test_counts_of_sac_are_checked(run):
+    outcome = run("train", TASK, "--learner", "sac", "--agent.algorithm.num-updates", "0")
+    assert outcome.status == 1
+    assert "--agent.algorithm.num-updates is 0" in outcome.message
+
+
+# The run.
+
+
+def test_the_run_says_its_learner(of_sac):
+    assert read_run_info(of_sac)["learner"] == "sac"
+    params = yaml.safe_load((of_sac / "params" / "agent.yaml").read_text())
+    assert params["algorithm"]["class_name"] == "mjlab.rl.sac:SAC"
+
+
+@pytest.mark.parametrize(
+    ("flags", "world_size", "threads"),
+    [
+        ([], 1, 2),
+        (["--learner", "ppo"], 1, 3),
+        (["--num-envs", "1"], 1, 1),
+        (["--env.sim.num-threads", "3"], 1, 3),
+        ([], 2, 3),
+    ],
+)
+def test_the_physics_leaves_a_core_to_sac(monkeypatch, tmp_path, flags, world_size, threads):
+    monkeypatch.setattr("mjlab.sim.native.engine.cores_per_process", lambda: 3)
+    monkeypatch.setattr(environments, "cores_per_process", lambda: 3)
+    cfg = parse_train_flags(TASK, ["--learner", "sac", "--num-envs", "4", *flags], "train")
+    cfg.apply_short_forms(ProcessRank())
+    before = cfg.env.sim.num_threads
+    env = environments.training_env(cfg, "cpu", tmp_path, ProcessRank(0, world_size, 0, world_size))
+    try:
+        assert env.unwrapped.sim.capabilities.num_threads == threads
+        # Evaluations copy the config, and nothing is learned while they run.
+        assert env.unwrapped.cfg.sim.num_threads == before
+    finally:
+        env.close()
+
+
+# Resuming.
+
+
+def resume(run, first: Path, *flags: str):
+    root = ("--log-root", str(first.parents[1]), "--agent.max-iterations", "3")
+    steps = ("--agent.num-steps-per-env", "8", "--device", "cpu", "--agent.resume", "True")
+    return run("train", TASK, *root, *steps, *flags)
+
+
+def test_resuming_keeps_the_learner_and_takes_its_flags(run, first):
+    # A run of another tool, or of an older release, does not say its learner.
+    (first / "run.json").unlink()
+    hidden = ("--agent.actor.hidden-dims", "(8,)", "--agent.algorithm.replay-steps", "9")
+    outcome = resume(run, first, *hidden, *OF_SAC)
+    assert outcome.status == 0, outcome.err
+    assert "Resuming with the learner 'sac', as before." in outcome.err
+    (new,) = set(first.parent.iterdir()) - {first}
+    params = yaml.safe_load((new / "params" / "agent.yaml").read_text())
+    assert params["algorithm"]["batch_size"] == 32
+    assert read_run_info(new)["learner"] == "sac"
+
+
+def test_a_run_of_ppo_is_resumed_without_a_word_about_learners(run, trained, tmp_path):
+    first = shutil.copytree(trained, tmp_path / "cartpole" / "2026-01-01_00-00-00")
+    outcome = resume(run, first)
+    assert outcome.status == 0, outcome.err
+    assert "learner" not in outcome.err
+    assert resume(run, first, *OF_SAC).status == 2
+
+
+def test_a_profile_that_chooses_sac_leaves_runs_of_ppo_as_they_are(
+    monkeypatch, trained, tmp_path, capsys
+):
+    registry.list_tasks()
+    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))
+    own = registry._tasks[TASK]
+    registry.register_mjlab_task(
+        "Test-Learner",
+        own.env_cfg,
+        rl_cfg=own.rl_cfg,
+        profiles={"cpu": lambda env_cfg, rl_cfg: with_learner(rl_cfg, "sac")},
+    )
+    first = shutil.copytree(trained, tmp_path / "cartpole" / "2026-01-01_00-00-00")
+    write_run_info(first, task="Test-Learner", profile="cpu")
+    flags = ["--log-root", str(tmp_path), "--agent.resume", "True"]
+    cfg = parse_train_flags("Test-Learner", flags, "train")
+    assert (cfg.profile, cfg.learner) == ("cpu", "ppo")
+    ppo = TrainConfig.from_task(TASK).agent
+    assert cfg.agent == replace(ppo, resume=True)
+    assert "Resuming with the learner 'ppo'" in capsys.readouterr().err
+    cfg = parse_train_flags("Test-Learner", ["--profile", "cpu"], "train")
+    assert cfg.agent == with_learner(ppo, "sac")
+
+
+def test_a_run_of_another_learner_is_refused_and_named(run, first):
+    outcome = resume(run, first, "--learner", "ppo")
+    assert outcome.status == 1
+    assert f"{first.name} is of the learner 'sac'" in outcome.message
+    # Where only the checkpoint says it.
+    (first / "run.json").unlink()
+    outcome = resume(run, first, "--learner", "ppo")
+    assert outcome.status == 1
+    assert f"--learner: expected 'sac', which wrote {first / 'model_1.pt'}" in outcome.message
+    assert list(first.parent.iterdir()) == [first]
+
+
+# Policies.
+
+
+def test_play_and_evaluate_need_not_be_told(run, of_sac, tmp_path):
+    common = ("--log-root", str(of_sac.parents[1]), "--device", "cpu")
+    short = ("--num-episodes", "4", "--max-steps", "3", "--json")
+    for flags in ((), ("--learner", "sac")):
+        outcome = run("evaluate", TASK, *short, *common, *flags)
+        assert outcome.status == 0, outcome.err
+        assert json.loads(outcome.out)["policy"] == str(of_sac / "model_1.pt")
+    outcome = run("play", TASK, "--viewer", "none", "--num-steps", "2", *common)
+    assert outcome.status == 0, outcome.err
+    named = ("--checkpoint-file", str(of_sac / "model_1.pt"), "--learner", "ppo")
+    outcome = run("play", TASK, "--viewer", "none", "--num-steps", "2", *common, *named)
+    assert outcome.status == 1
+    assert "--learner: expected 'sac'" in outcome.message
+
+
+def test_the_newest_policy_of_a_learner_is_played(run, first, trained):
+    newer = shutil.copytree(trained, first.with_name("2026-01-02_00-00-00"))
+    (newer / "model_1.pt").touch()
+    common = ("--log-root", str(first.parents[1]), "--device", "cpu")
+    for flags, expected in (((), newer), (("--learner", "sac"), first)):
+        outcome = run("play", TASK, "--viewer", "none", "--num-steps", "2", *common, *flags)
+        assert outcome.status == 0, outcome.err
+        assert f"Checkpoint: {expected / 'model_1.pt'}" in outcome.err
+    (newer / "run.json").unlink()
+    shutil.rmtree(first)
+    write_run_info(newer, learner="ppo")
+    outcome = run("play", TASK, "--viewer", "none", "--num-steps", "2", *common, *flags)
+    assert "by the learner 'sac'. Run `train Mjlab-Cartpole-Swingup --learner sac`" in (
+        outcome.message
+    )
+
+
+def test_its_policy_is_that_of_its_export_and_takes_neither_thread_nor_replay(of_sac):
+    checkpoint = of_sac / "model_1.pt"
+    cfg = _agent_cfg(TASK, checkpoint, learner="sac")
+    assert cfg["actor"]["hidden_dims"] == [8]
+    assert cfg["algorithm"]["replay_steps"] == 1
+    env_cfg = env_cfg_of(TASK, EvaluateConfig(), checkpoint, purpose="evaluate")
+    env = make_env(TASK, env_cfg, "cpu", 5)
+    before = set(threading.enumerate())
+    try:
+        policy = load_policy(TASK, env, checkpoint, "cpu")
+        observations = env.get_observations()
+        with torch.inference_mode():
+            actions = policy(observations)
+            (exported,) = of_sac.glob("*.onnx")
+            ours = load_policy(TASK, env, exported, "cpu")(observations)
+    finally:
+        env.close()
+    assert set(threading.enumerate()) <= before
+    session = onnxruntime.InferenceSession(exported)
+    theirs = [
+        session.run(["actions"], {"obs": row[None].numpy()})[0] for row in observations["actor"]
+    ]
+    assert actions.abs().max() < 1.0
+    torch.testing.assert_close(torch.from_numpy(theirs[0]), actions[:1], atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(ours, actions, atol=1e-5, rtol=0.0)
+
+
+def test_the_live_view_shows_it(tmp_path, monkeypatch):
+    import viser
+
+    from mjlab.rl import MjlabOnPolicyRunner
+    from mjlab.scripts.live import _make_viewer
+
+    cfg = TrainConfig.from_task(TASK, learner="sac")
+    cfg.env.scene.num_envs = 2
+    server = viser.ViserServer(host="127.0.0.1", port=18331, verbose=False)
+    monkeypatch.setattr(server, "get_clients", lambda: {0: SimpleNamespace()})
+    try:
+        job = LiveJob(TASK, _env_to_show(cfg), cfg.agent, MjlabOnPolicyRunner)
+        exchange = Exchange(tmp_path)
+        viewer = _make_viewer(job, exchange, server)
+        network = viewer._take_stats.__self__._network
+        state = {name: value.clone() + 1 for name, value in network.state_dict().items()}
+        exchange.write_weights(SimpleNamespace(state_dict=lambda: state), 5, None)
+        viewer.run(num_steps=2)
+        assert all(torch.equal(network.state_dict()[name], state[name]) for name in state)
+        viewer.env.close()
+    finally:
+        server.stop()
+
+
+# Other tasks and several processes.
+
+
+@pytest.mark.parametrize(
+    "task", ["Mjlab-Tracking-Flat-Unitree-G1", "Mjlab-Velocity-Flat-Unitree-Go1"]
+)
+def test_tasks_with_runners_of_their_own_learn_by_it(run, tmp_path, task):
+    common = ("--log-root", str(tmp_path), "--device", "cpu")
+    small = ("--num-envs", "4", "--agent.max-iterations", "1", "--agent.num-steps-per-env", "3")
+    profile = ("--profile", "cpu") if "Go1" in task else ()
+    outcome = run("train", task, *common, *small, *profile, *SAC)
+    assert outcome.status == 0, outcome.err
+    outcome = run("play", task, *common, "--viewer", "none", "--num-steps", "2")
+    assert outcome.status == 0, outcome.err
+    (exported,) = tmp_path.glob("*/*/*.onnx")
+    outputs = [output.name for output in onnxruntime.InferenceSession(exported).get_outputs()]
+    assert ("joint_pos" in outputs) == ("Tracking" in task)
+
+
+def test_two_processes_hold_the_same_networks(tmp_path):
+    pair = ProcessRun(tmp_path, "--agent.max-iterations", "2", *SAC)
+    ended = pair.end()
+    assert [process.status for process in ended] == [0, 0], ended
+    first, second = pair.probe(0)["weights"], pair.probe(1)["weights"]
+    assert [name for name in first if not torch.equal(first[name], second[name])] == []
+    assert not torch.equal(pair.probe(0)["qpos"], pair.probe(1)["qpos"])

@@ -1,0 +1,3 @@
+"""Boxes and borders that sub-terrains share."""
+
+from __future__ import annotations
