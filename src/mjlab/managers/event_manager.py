@@ -88,10 +88,11 @@ class EventManager(TermFunctionSwitches, TermListManager):
                 )
             if term.mode == "interval":
                 self._lookups[name] = Lookup()
-                is_global = term.is_global_time
-                self._timers[name] = (
-                    self._draw_global(term) if is_global else self._draw(term, self.num_envs)
-                )
+                if term.is_global_time:
+                    # On the host, which would wait for a number drawn on a GPU.
+                    self._timers[name] = self._draw(term, 1, "cpu").item()
+                else:
+                    self._timers[name] = self._draw(term, self.num_envs)
 
     @property
     def active_terms(self) -> dict[str, list[str]]:  # ty: ignore[incompatible-property-override]
@@ -187,7 +188,7 @@ class EventManager(TermFunctionSwitches, TermListManager):
         if not isinstance(timer, torch.Tensor):
             timer -= dt
             due = timer < _TIMER_TOLERANCE
-            self._timers[name] = self._draw_global(cfg) if due else timer
+            self._timers[name] = self._draw(cfg, 1, "cpu").item() if due else timer
             if due:
                 cfg.func(self._env, None, **cfg.params)
             return due
@@ -231,10 +232,6 @@ class EventManager(TermFunctionSwitches, TermListManager):
         low, high = cfg.interval_range_s or (0.0, 0.0)
         drawn = torch.rand(count, dtype=torch.float32, device=device or self.device)
         return drawn * (high - low) + low
-
-    def _draw_global(self, cfg: EventTermCfg) -> float:
-        # On the host, which would wait for a number drawn on a GPU.
-        return self._draw(cfg, 1, "cpu").item()
 
     def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
         terms = zip(self._term_names, self._term_cfgs, strict=True)

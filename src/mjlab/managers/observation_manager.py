@@ -299,7 +299,7 @@ class ObservationGroup:
     Raises `ValueError` if the terms cannot be joined.
     """
 
-    _transient = {"name", "shape", "_dim", "_checks_result"}
+    _transient = {"name", "shape", "_dim", "_nan_policy"}
 
     def __init__(
         self, name: str, cfg: ObservationGroupCfg, terms: dict[str, ObservationTerm]
@@ -309,7 +309,7 @@ class ObservationGroup:
         self.terms = terms
         dim = cfg.concatenate_dim
         self._dim = dim + 1 if dim >= 0 else dim
-        self._checks_result = cfg.nan_policy != "disabled" and not cfg.nan_check_per_term
+        self._nan_policy: NanPolicy = "disabled" if cfg.nan_check_per_term else cfg.nan_policy
         self.shape = self._joined_shape() if cfg.concatenate_terms else None
 
     def compute(
@@ -319,9 +319,9 @@ class ObservationGroup:
         values = [term.compute(update_history, env_ids) for term in self.terms.values()]
         if self.cfg.concatenate_terms:
             # Joining copies, also a single tensor.
-            return self._checked(torch.cat(values, dim=self._dim), self.name)
+            return apply_nan_policy(torch.cat(values, dim=self._dim), self._nan_policy, self.name)
         return {
-            name: self._checked(value.clone(), f"{self.name}/{name}")
+            name: apply_nan_policy(value.clone(), self._nan_policy, f"{self.name}/{name}")
             for name, value in zip(self.terms, values, strict=True)
         }
 
@@ -332,11 +332,6 @@ class ObservationGroup:
         dim = self._axis() + 1
         parts = observation.split([term.shape[dim - 1] for term in self.terms.values()], dim=dim)
         return dict(zip(self.terms, parts, strict=True))
-
-    def _checked(self, value: torch.Tensor, label: str) -> torch.Tensor:
-        if not self._checks_result:
-            return value
-        return apply_nan_policy(value, self.cfg.nan_policy, label)
 
     def _axis(self) -> int:
         """Return the dimension to join along, counted without the environment dimension."""
