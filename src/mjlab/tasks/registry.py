@@ -34,13 +34,6 @@ if TYPE_CHECKING:
     Profile = Callable[[Any, Any], RslRlBaseRunnerCfg | None]
 
 
-# MERGED mjlab.tasks.registry: What a task adds to the command line, and how it gets what it needs before it is built.
-#
-# A task that needs something (a recorded motion, say) is registered with a dataclass, `options=`, whose
-# fields become flags of `train`, `play`, `evaluate` and `profile-env` for this task. The scripts know
-# nothing of what is in it: they call `prepare` before they build the environment.
-
-
 @dataclass(frozen=True)
 class PolicyOrigin:
     """Where the policy comes from that is to act, as far as there is one."""

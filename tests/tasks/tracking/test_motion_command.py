@@ -9,7 +9,7 @@ import torch
 from tracking_tasks import G1, G1_BLIND, part_of, task_cfg, unperturbed
 
 from mjlab.envs import ManagerBasedRlEnv
-from mjlab.tasks.tracking.mdp import commands as start_module
+from mjlab.tasks.tracking.mdp import motion_sampling as start_module
 from mjlab.tasks.tracking.mdp.commands import MotionCommandCfg
 from mjlab.tasks.tracking.mdp.motion_library import MotionFrame
 from mjlab.utils.lab_api.math import quat_from_euler_xyz, quat_mul

@@ -22,7 +22,7 @@ from mjlab.rl.exporter_utils import (
     metadata_texts,
 )
 from mjlab.tasks.velocity import mdp
-from mjlab.tasks.velocity.gait_figures import GAIT_FIGURES
+from mjlab.tasks.velocity.gait_metrics import GAIT_METRICS
 from mjlab.tasks.velocity.symmetry import mirror_left_right
 
 GO1 = "Mjlab-Velocity-Flat-Unitree-Go1"
@@ -469,7 +469,7 @@ def test_gait_metrics_agree_with_what_they_are_made_of(make_env):
     for _ in range(30):
         env.step(0.1 * torch.randn_like(no_action(env)))
     robot = env.scene["robot"]
-    values = {name: func(env) for name, func in GAIT_FIGURES.items()}
+    values = {name: func(env) for name, func in GAIT_METRICS.items()}
     assert all(value.shape == (4,) and value.isfinite().all() for value in values.values())
     torque = robot.data.qfrc_actuator
     torch.testing.assert_close(values["joint_torque"], torque.abs().mean(dim=1))
@@ -502,6 +502,6 @@ def test_the_action_rate_does_not_depend_on_the_scale_of_actions(make_env):
         env = make_env(GO1, edit=edit)
         for target in (0.1, -0.2):
             env.step(torch.full_like(no_action(env), target / scale))
-        rates.append(GAIT_FIGURES["action_rate"](env).tolist())
+        rates.append(GAIT_METRICS["action_rate"](env).tolist())
     assert rates[0] == pytest.approx(rates[1])
     assert rates[0] == pytest.approx([0.3] * 4)

@@ -13,8 +13,6 @@ import numpy as np
 
 from mjlab.tasks.tracking.motion_file import Motion, MotionFileError
 
-# MERGED mjlab.tasks.tracking.motion_recording: From joint angles to motions: resampling in time, velocities, and the bodies of the robot.
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
@@ -199,11 +197,6 @@ def _check(recording: Recording, model: mujoco.MjModel) -> None:
             f"The recording has {recording.joint_pos.shape[1]} joints, and the robot {model.nq - 7}."
         )
 
-
-# MERGED mjlab.tasks.tracking.motion_recording: Recordings as CSV, in the layout of the retargeted LAFAN1 sets.
-#
-# No header, comma separated, one pose a line: position of the root (m), its quaternion x y z w, and the
-# angles of all joints (rad) in the order of the robot.
 
 _ROOT_COLUMNS = 7
 _QUAT_TOLERANCE = 1e-2

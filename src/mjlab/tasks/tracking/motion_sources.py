@@ -14,11 +14,6 @@ from typing import Any
 from mjlab.tasks.tracking.motion_file import MotionFileError, motion_hash
 from mjlab.utils.os import own_folder, replacing
 
-# MERGED mjlab.tasks.tracking.motion_sources: The motions that a run was trained on, kept in its folder: copies, where they came from, hashes.
-#
-# <run>/motion/motions.json   [{"file": "squat.npz", "source": "...", "sha256": "..."}, ...]
-# <run>/motion/squat.npz      the copies, in that order
-
 FOLDER = "motion"
 """Name of the folder, in that of the run."""
 INDEX = "motions.json"
@@ -86,8 +81,6 @@ def _free_name(name: str, taken: list[str]) -> str:
         name, number = f"{stem}-{number}.npz", number + 1
     return name
 
-
-# MERGED mjlab.tasks.tracking.motion_sources: Motions at Weights & Biases: fetching those of a registry or of a run.
 
 _ARTIFACT_TYPE = "motions"
 _ARTIFACT_FILE = "motion.npz"

@@ -4,12 +4,14 @@ A robot whose left is made like its right can take the mirror image of each samp
 sample, which costs no physics (Mittal et al., "Symmetry Considerations for Learning Task Symmetric
 Robot Policies", ICRA 2024). `mirror_left_right` is what `symmetry_cfg` of `RslRlPpoAlgorithmCfg`
 names.
+
+The mirror is the plane of x and z of the robot's root. In it directions change the sign of y, and axes of
+rotation those of x and z.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -24,12 +26,6 @@ from mjlab.tasks.velocity import mdp
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
-
-# MERGED mjlab.tasks.velocity.symmetry: Left and right of a robot: which joints and feet are mirror images of which, and with what sign.
-#
-# The mirror is the plane of x and z of the robot's root. In it directions change the sign of y, and
-# axes of rotation those of x and z.
-
 DIRECTION = (1.0, -1.0, 1.0)
 ROTATION = (-1.0, 1.0, -1.0)
 _SIDES = {"left": "right", "FL": "FR", "RL": "RR"}
@@ -38,143 +34,8 @@ _OTHER_SIDE = _SIDES | {right: left for left, right in _SIDES.items()}
 # By how much partners may differ: axes (unit vectors), default positions (rad), places (m).
 _AXIS_TOLERANCE, _POSE_TOLERANCE, PLACE_TOLERANCE = 1e-4, 1e-3, 5e-3
 WITHOUT = "To learn without mirror images, set agent.algorithm.symmetry_cfg to None."
-
-
-class Coupling(NamedTuple):
-    """A share of one number in the mirror image of another."""
-
-    target: int
-    """Number of the image."""
-    source: int
-    """Number that is read."""
-    factor: float
-
-
-class Mirror:
-    """Mirror image of a vector of numbers.
-
-    Number i is `signs[i]` times number `sources[i]`, and what the couplings of i add.
-    """
-
-    def __init__(
-        self, sources: Sequence[int], signs: Sequence[float], couplings: Sequence[Coupling] = ()
-    ) -> None:
-        """Take indices and signs, of one length."""
-        self.sources = torch.tensor(sources)
-        self.signs = torch.tensor(signs, dtype=torch.float32)
-        self._targets = torch.tensor([coupling.target for coupling in couplings]).long()
-        self._read = torch.tensor([coupling.source for coupling in couplings]).long()
-        self._factors = torch.tensor(
-            [coupling.factor for coupling in couplings], dtype=torch.float32
-        )
-
-    def __len__(self) -> int:
-        return len(self.signs)
-
-    def __call__(self, values: torch.Tensor) -> torch.Tensor:
-        """Return the mirror image of `values` (N, numbers)."""
-        if self.signs.device != values.device:
-            for name in ("sources", "signs", "_targets", "_read", "_factors"):
-                setattr(self, name, getattr(self, name).to(values.device))
-        image = values[:, self.sources] * self.signs
-        if len(self._targets):
-            image.index_add_(1, self._targets, values[:, self._read] * self._factors)
-        return image
-
-    @staticmethod
-    def joined(mirrors: Sequence[Mirror], couplings: Sequence[Coupling] = ()) -> Mirror:
-        """Return the mirror of vectors that stand one behind the other, coupled as given."""
-        sources: list[int] = []
-        signs: list[float] = []
-        for mirror in mirrors:
-            sources += [len(signs) + source for source in mirror.sources.tolist()]
-            signs += mirror.signs.tolist()
-        return Mirror(sources, signs, couplings)
-
-
-def partners(names: Sequence[str]) -> list[int]:
-    """Return the index of what is on the other side, for each name; what is in the middle stays.
-
-    Raises:
-        ValueError: the other side of a name is not among them.
-    """
-    others = [other_side(name) for name in names]
-    missing = sorted(set(others) - set(names))
-    if missing:
-        raise ValueError(
-            f"mirror_left_right finds no {', '.join(missing)} among {', '.join(names)}. It knows the "
-            f"sides by these parts of names: {', '.join(_OTHER_SIDE)}. {WITHOUT}"
-        )
-    return [list(names).index(other) for other in others]
-
-
-def other_side(name: str) -> str:
-    """Return the name of what is on the other side; the same for what is in the middle."""
-    return "_".join(_OTHER_SIDE.get(part, part) for part in name.split("_"))
-
-
-def mirror_of_joints(model: mujoco.MjModel, robot: Any) -> Mirror:
-    """Return the mirror of the joints of `robot`, an entity, in its order.
-
-    Joints belong together by their names. A joint turns, or slides, the other way in the mirror
-    where the mirror image of its axis points against its partner's.
-
-    Raises:
-        ValueError: a joint is not the mirror image of its partner.
-    """
-    names = robot.joint_names
-    pairs = partners(names)
-    axes, places, is_slide = _joint_frames(model, robot)
-    reflect = torch.where(
-        is_slide[:, None],
-        torch.tensor(DIRECTION, dtype=torch.float32),
-        torch.tensor(ROTATION, dtype=torch.float32),
-    )
-    signs = ((axes * reflect)[pairs] * axes).sum(dim=1)
-    pose = robot.data.default_joint_pos[0].cpu()
-    apart = (places[pairs] * torch.tensor(DIRECTION, dtype=torch.float32) - places).norm(dim=1)
-    for i, partner in enumerate(pairs):
-        if (
-            abs(abs(signs[i]) - 1) > _AXIS_TOLERANCE
-            or apart[i] > PLACE_TOLERANCE
-            or abs(pose[i] - signs[i] * pose[partner]) > _POSE_TOLERANCE
-        ):
-            raise ValueError(
-                f"Joint {names[i]!r} is not the mirror image of {names[partner]!r}: axes "
-                f"{_shown(axes[i])} and {_shown(axes[partner])}, places {_shown(places[i])} and "
-                f"{_shown(places[partner])}, default positions {pose[i]:.4g} and {pose[partner]:.4g}. "
-                "Joints belong together by these parts of their names: "
-                f"{', '.join(_OTHER_SIDE)}. {WITHOUT}"
-            )
-    return Mirror(pairs, signs.round().tolist())
-
-
-def _joint_frames(
-    model: mujoco.MjModel, robot: Any
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return axes and places (joints, 3) in the frame of the root at `qpos0`, and which slide."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    root = int(robot.indexing.root_body_id)
-    ids = robot.indexing.joint_ids.tolist()
-    to_root = data.xmat[root].reshape(3, 3)
-    axes = data.xaxis[ids] @ to_root
-    places = (data.xanchor[ids] - data.xpos[root]) @ to_root
-    is_slide = model.jnt_type[ids] == mujoco.mjtJoint.mjJNT_SLIDE
-    return (
-        torch.tensor(axes, dtype=torch.float32),
-        torch.tensor(places, dtype=torch.float32),
-        torch.tensor(is_slide),
-    )
-
-
-def _shown(vector: torch.Tensor) -> str:
-    return "(" + ", ".join(f"{value:.3g}" for value in vector.tolist()) + ")"
-
-
 _ROBOT = "robot"
 _PLANAR_VELOCITY = (1.0, -1.0, -1.0)
-
 # Of (sin, cos): the other side steps then, for walks and trots.
 _HALF_A_CYCLE_LATER = (-1.0, -1.0)
 _OF_SENSOR = {
@@ -182,19 +43,8 @@ _OF_SENSOR = {
     mujoco.mjtSensor.mjSENS_VELOCIMETER: DIRECTION,
     mujoco.mjtSensor.mjSENS_ACCELEROMETER: DIRECTION,
 }
-
 # Metres, or parts of a unit vector, that rays and axes may be off.
 _TOLERANCE = 1e-4
-
-
-@dataclass(frozen=True)
-class _Mirrors:
-    """The mirrors of an environment's observation groups, by name, and of its actions."""
-
-    groups: dict[str, Mirror]
-    actions: Mirror
-
-
 _known: WeakKeyDictionary[Any, _Mirrors] = WeakKeyDictionary()
 
 
@@ -218,7 +68,7 @@ def mirror_left_right(
     env = env.unwrapped
     mirrors = _known.get(env)
     if mirrors is None:
-        mirrors = _known[env] = _build(env)
+        mirrors = _known[env] = _Mirrors(env)
     if obs is not None:
         image = obs.clone()
         for group in set(image.keys()):
@@ -229,24 +79,27 @@ def mirror_left_right(
     return obs, actions
 
 
-def _build(env: ManagerBasedRlEnv) -> _Mirrors:
-    manager = env.observation_manager
-    groups = {}
-    for group, names in manager.active_terms.items():
-        if not manager.group_obs_concatenate[group]:
-            raise ValueError(
-                f"The observation group {group!r} has concatenate_terms=False, and mirror_left_right "
-                f"takes groups that are one tensor. {WITHOUT}"
-            )
-        shapes = manager.group_obs_term_dim[group]
-        terms = {
-            name: _mirror_of_term(env, group, name, shape)
-            for name, shape in zip(names, shapes, strict=True)
-        }
-        starts = accumulate(map(len, terms.values()), initial=0)
-        couplings = _lever_arms(env, group, dict(zip(terms, starts, strict=False)))
-        groups[group] = Mirror.joined(list(terms.values()), couplings)
-    return _Mirrors(groups, _of_actions(env))
+class _Mirrors:
+    """The mirrors of an environment's observation groups, by name, and of its actions."""
+
+    def __init__(self, env: ManagerBasedRlEnv) -> None:
+        manager = env.observation_manager
+        self.groups: dict[str, Mirror] = {}
+        for group, names in manager.active_terms.items():
+            if not manager.group_obs_concatenate[group]:
+                raise ValueError(
+                    f"The observation group {group!r} has concatenate_terms=False, and mirror_left_right "
+                    f"takes groups that are one tensor. {WITHOUT}"
+                )
+            shapes = manager.group_obs_term_dim[group]
+            terms = {
+                name: _mirror_of_term(env, group, name, shape)
+                for name, shape in zip(names, shapes, strict=True)
+            }
+            starts = accumulate(map(len, terms.values()), initial=0)
+            couplings = _lever_arms(env, group, dict(zip(terms, starts, strict=False)))
+            self.groups[group] = Mirror.joined(list(terms.values()), couplings)
+        self.actions = _of_actions(env)
 
 
 def _mirror_of_term(
@@ -283,23 +136,7 @@ def _num_instants(env: ManagerBasedRlEnv, group: str, name: str) -> int:
     return max(1, env.observation_manager.get_term_cfg(group, name).history_length)
 
 
-def _direction(*_: Any) -> Mirror:
-    return Mirror(range(3), DIRECTION)
-
-
-def _rotation(*_: Any) -> Mirror:
-    return Mirror(range(3), ROTATION)
-
-
-class _Sensor(NamedTuple):
-    """A sensor at a site."""
-
-    name: str
-    kind: mujoco.mjtSensor
-    body: int
-    """Id of the body that carries it."""
-    y: float
-    """Distance from the mirror plane (m), positive to the left."""
+# Terms: what each measures, and so its mirror image.
 
 
 def _of_sensor(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
@@ -313,6 +150,17 @@ def _of_sensor(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
             f"place it in the middle. {WITHOUT}"
         )
     return Mirror(range(3), _OF_SENSOR[sensor.kind])
+
+
+class _Sensor(NamedTuple):
+    """A sensor at a site."""
+
+    name: str
+    kind: mujoco.mjtSensor
+    body: int
+    """Id of the body that carries it."""
+    y: float
+    """Distance from the mirror plane (m), positive to the left."""
 
 
 def _sensor(env: ManagerBasedRlEnv, name: str) -> _Sensor:
@@ -382,6 +230,11 @@ def _lever_arms(env: ManagerBasedRlEnv, group: str, starts: dict[str, int]) -> l
     for name, cfg in terms.items():
         if cfg.func is envs_mdp.base_ang_vel:
             turning[name] = _reference_pose(env)[1]
+
+    def has_same_lag(*names: str) -> bool:
+        lags = [(terms[name].delay_min_lag, terms[name].delay_max_lag) for name in names]
+        return len({lag for bounds in lags for lag in bounds}) == 1
+
     couplings = []
     for name, sensor in sensors.items():
         if sensor.kind != mujoco.mjtSensor.mjSENS_VELOCIMETER or abs(sensor.y) < _TOLERANCE:
@@ -393,7 +246,7 @@ def _lever_arms(env: ManagerBasedRlEnv, group: str, starts: dict[str, int]) -> l
                 if body == sensor.body
                 and _factor(terms[other]) != 0.0
                 and instants[other] == instants[name]
-                and _same_lag(terms[name], terms[other])
+                and has_same_lag(name, other)
             ),
             None,
         )
@@ -419,12 +272,6 @@ def _lever_arms(env: ManagerBasedRlEnv, group: str, starts: dict[str, int]) -> l
 def _factor(cfg: Any) -> float:
     """Return the scale of a term, which is one number."""
     return 1.0 if cfg.scale is None else float(cfg.scale)
-
-
-def _same_lag(one: Any, other: Any) -> bool:
-    """Return whether two terms are always delayed by the same time."""
-    lags = {one.delay_min_lag, one.delay_max_lag, other.delay_min_lag, other.delay_max_lag}
-    return len(lags) == 1
 
 
 def _of_command(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
@@ -517,9 +364,9 @@ def _of_rays(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
 
 _KINDS: dict[Any, Callable[..., Mirror]] = {
     envs_mdp.builtin_sensor: _of_sensor,
-    envs_mdp.base_lin_vel: _direction,
-    envs_mdp.base_ang_vel: _rotation,
-    envs_mdp.projected_gravity: _direction,
+    envs_mdp.base_lin_vel: lambda *_: Mirror(range(3), DIRECTION),
+    envs_mdp.base_ang_vel: lambda *_: Mirror(range(3), ROTATION),
+    envs_mdp.projected_gravity: lambda *_: Mirror(range(3), DIRECTION),
     envs_mdp.joint_pos_rel: _of_joints,
     envs_mdp.joint_vel_rel: _of_joints,
     envs_mdp.last_action: _of_actions,
@@ -531,3 +378,138 @@ _KINDS: dict[Any, Callable[..., Mirror]] = {
     mdp.foot_contact: _of_feet,
     mdp.foot_contact_forces: _of_foot_vectors,
 }
+
+
+# Mirrors of vectors, and the left and right of joints and feet.
+
+
+class Mirror:
+    """Mirror image of a vector of numbers.
+
+    Number i is `signs[i]` times number `sources[i]`, and what the couplings of i add.
+    """
+
+    def __init__(
+        self, sources: Sequence[int], signs: Sequence[float], couplings: Sequence[Coupling] = ()
+    ) -> None:
+        """Take indices and signs, of one length."""
+        self.sources = torch.tensor(sources)
+        self.signs = torch.tensor(signs, dtype=torch.float32)
+        self._targets = torch.tensor([coupling.target for coupling in couplings]).long()
+        self._read = torch.tensor([coupling.source for coupling in couplings]).long()
+        self._factors = torch.tensor(
+            [coupling.factor for coupling in couplings], dtype=torch.float32
+        )
+
+    def __len__(self) -> int:
+        return len(self.signs)
+
+    def __call__(self, values: torch.Tensor) -> torch.Tensor:
+        """Return the mirror image of `values` (N, numbers)."""
+        if self.signs.device != values.device:
+            for name in ("sources", "signs", "_targets", "_read", "_factors"):
+                setattr(self, name, getattr(self, name).to(values.device))
+        image = values[:, self.sources] * self.signs
+        if len(self._targets):
+            image.index_add_(1, self._targets, values[:, self._read] * self._factors)
+        return image
+
+    @staticmethod
+    def joined(mirrors: Sequence[Mirror], couplings: Sequence[Coupling] = ()) -> Mirror:
+        """Return the mirror of vectors that stand one behind the other, coupled as given."""
+        sources: list[int] = []
+        signs: list[float] = []
+        for mirror in mirrors:
+            sources += [len(signs) + source for source in mirror.sources.tolist()]
+            signs += mirror.signs.tolist()
+        return Mirror(sources, signs, couplings)
+
+
+class Coupling(NamedTuple):
+    """A share of one number in the mirror image of another."""
+
+    target: int
+    """Number of the image."""
+    source: int
+    """Number that is read."""
+    factor: float
+
+
+def mirror_of_joints(model: mujoco.MjModel, robot: Any) -> Mirror:
+    """Return the mirror of the joints of `robot`, an entity, in its order.
+
+    Joints belong together by their names. A joint turns, or slides, the other way in the mirror
+    where the mirror image of its axis points against its partner's.
+
+    Raises:
+        ValueError: a joint is not the mirror image of its partner.
+    """
+    names = robot.joint_names
+    pairs = partners(names)
+    axes, places, is_slide = _joint_frames(model, robot)
+    reflect = torch.where(
+        is_slide[:, None],
+        torch.tensor(DIRECTION, dtype=torch.float32),
+        torch.tensor(ROTATION, dtype=torch.float32),
+    )
+    signs = ((axes * reflect)[pairs] * axes).sum(dim=1)
+    pose = robot.data.default_joint_pos[0].cpu()
+    apart = (places[pairs] * torch.tensor(DIRECTION, dtype=torch.float32) - places).norm(dim=1)
+    for i, partner in enumerate(pairs):
+        if (
+            abs(abs(signs[i]) - 1) > _AXIS_TOLERANCE
+            or apart[i] > PLACE_TOLERANCE
+            or abs(pose[i] - signs[i] * pose[partner]) > _POSE_TOLERANCE
+        ):
+            raise ValueError(
+                f"Joint {names[i]!r} is not the mirror image of {names[partner]!r}: axes "
+                f"{_shown(axes[i])} and {_shown(axes[partner])}, places {_shown(places[i])} and "
+                f"{_shown(places[partner])}, default positions {pose[i]:.4g} and {pose[partner]:.4g}. "
+                "Joints belong together by these parts of their names: "
+                f"{', '.join(_OTHER_SIDE)}. {WITHOUT}"
+            )
+    return Mirror(pairs, signs.round().tolist())
+
+
+def _joint_frames(
+    model: mujoco.MjModel, robot: Any
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return axes and places (joints, 3) in the frame of the root at `qpos0`, and which slide."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    root = int(robot.indexing.root_body_id)
+    ids = robot.indexing.joint_ids.tolist()
+    to_root = data.xmat[root].reshape(3, 3)
+    axes = data.xaxis[ids] @ to_root
+    places = (data.xanchor[ids] - data.xpos[root]) @ to_root
+    is_slide = model.jnt_type[ids] == mujoco.mjtJoint.mjJNT_SLIDE
+    return (
+        torch.tensor(axes, dtype=torch.float32),
+        torch.tensor(places, dtype=torch.float32),
+        torch.tensor(is_slide),
+    )
+
+
+def _shown(vector: torch.Tensor) -> str:
+    return "(" + ", ".join(f"{value:.3g}" for value in vector.tolist()) + ")"
+
+
+def partners(names: Sequence[str]) -> list[int]:
+    """Return the index of what is on the other side, for each name; what is in the middle stays.
+
+    Raises:
+        ValueError: the other side of a name is not among them.
+    """
+    others = [other_side(name) for name in names]
+    missing = sorted(set(others) - set(names))
+    if missing:
+        raise ValueError(
+            f"mirror_left_right finds no {', '.join(missing)} among {', '.join(names)}. It knows the "
+            f"sides by these parts of names: {', '.join(_OTHER_SIDE)}. {WITHOUT}"
+        )
+    return [list(names).index(other) for other in others]
+
+
+def other_side(name: str) -> str:
+    """Return the name of what is on the other side; the same for what is in the middle."""
+    return "_".join(_OTHER_SIDE.get(part, part) for part in name.split("_"))

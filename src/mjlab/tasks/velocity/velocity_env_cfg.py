@@ -2,6 +2,7 @@
 
 A robot's package starts from `make_velocity_env_cfg()` and fills in what depends on the robot: the
 entity, its feet, sensors and gains. See `config/go1` and `config/g1`.
+`make_flat` and `make_playable` change what flat ground and playing change, whatever the robot.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from typing import Any
 from mjlab.compat import offers_older_sites
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.managers import (
-    ActionTermCfg,
     CommandTermCfg,
     CurriculumTermCfg,
     EventTermCfg,
@@ -30,25 +30,69 @@ from mjlab.sim import MujocoCfg, SimulationCfg
 from mjlab.tasks.velocity import mdp
 from mjlab.terrains import TerrainEntityCfg
 from mjlab.terrains.config import ROUGH_TERRAINS_CFG
+from mjlab.utils.errors import UnknownNameError
 from mjlab.utils.noise import UniformNoiseCfg
+from mjlab.utils.string import suggest
 from mjlab.viewer import ViewerConfig
 
-# MERGED mjlab.tasks.velocity.velocity_env_cfg: What flat ground and playing change, whatever the robot.
+# Filled in by the robot.
+_NO_NAMES: tuple[str, ...] = ()
 
 
-def get_sensor(cfg: ManagerBasedRlEnvCfg, name: str) -> Any:
-    """Return the config of a sensor of the scene; raises `KeyError`, with the names, if unknown."""
-    for sensor in cfg.scene.sensors:
-        if sensor.name == name:
-            return sensor
-    raise KeyError(
-        f"No sensor {name!r}; there are {[sensor.name for sensor in cfg.scene.sensors]}."
+@offers_older_sites
+def make_velocity_env_cfg() -> ManagerBasedRlEnvCfg:
+    """Return a new config of the task on rough terrain, without a robot.
+
+    It shares nothing with other configs, so that all of it may be edited. To be filled in are:
+
+    - `scene.entities["robot"]`, the frames of the sensors `terrain_scan` and `foot_height_scan`
+      and the latter's pattern, and a contact sensor `feet_ground_contact`;
+    - the action's scale; the bodies, geoms and sites of `foot_friction`, `base_com`, `upright`,
+      `body_ang_vel`, `foot_clearance` and `foot_slip`; and the standard deviations of `pose`;
+    - `viewer.body_name`.
+
+    Names of sensors and rewards left empty are refused when the environment is built. There is only
+    a warning for events, which then change nothing, and for rewards of weight 0 (here
+    `body_ang_vel` and `angular_momentum`), which are refused once they get a weight.
+    """
+    return ManagerBasedRlEnvCfg(
+        decimation=4,
+        episode_length_s=20.0,
+        scene=SceneCfg(
+            terrain=TerrainEntityCfg(
+                terrain_type="generator",
+                terrain_generator=copy.deepcopy(ROUGH_TERRAINS_CFG),
+                max_init_terrain_level=5,
+            ),
+            sensors=_sensors(),
+            num_envs=1,
+            extent=2.0,
+        ),
+        observations=_observations(),
+        actions={
+            "joint_pos": mdp.JointPositionActionCfg(
+                entity_name="robot", actuator_names=(".*",), scale=0.5, use_default_offset=True
+            )
+        },
+        commands=_commands(),
+        events=_events(),
+        rewards=_rewards(),
+        terminations=_terminations(),
+        curriculum=_curriculum(),
+        metrics={"mean_action_acc": MetricsTermCfg(func=mdp.mean_action_acc)},
+        sim=SimulationCfg(
+            nconmax=35,
+            njmax=1500,
+            mujoco=MujocoCfg(timestep=0.005, iterations=10, ls_iterations=20),
+        ),
+        viewer=ViewerConfig(
+            origin_type=ViewerConfig.OriginType.ASSET_BODY,
+            entity_name="robot",
+            body_name="",
+            distance=3.0,
+            elevation=-5.0,
+        ),
     )
-
-
-def remove_sensors(cfg: ManagerBasedRlEnvCfg, *names: str) -> None:
-    """Remove sensors from the scene."""
-    cfg.scene.sensors = tuple(s for s in cfg.scene.sensors if s.name not in names)
 
 
 def make_flat(cfg: ManagerBasedRlEnvCfg, play: bool) -> None:
@@ -106,60 +150,21 @@ def make_playable(cfg: ManagerBasedRlEnvCfg) -> None:
         terrain.terrain_generator.border_width = 10.0
 
 
-# Filled in by the robot.
-_NO_NAMES: tuple[str, ...] = ()
+def get_sensor(cfg: ManagerBasedRlEnvCfg, name: str) -> Any:
+    """Return the config of a sensor of the scene; raises `KeyError`, with the names, if unknown."""
+    for sensor in cfg.scene.sensors:
+        if sensor.name == name:
+            return sensor
+    names = [sensor.name for sensor in cfg.scene.sensors]
+    raise UnknownNameError(f"Unknown sensor {name!r}; {suggest(name, names)}")
 
 
-@offers_older_sites
-def make_velocity_env_cfg() -> ManagerBasedRlEnvCfg:
-    """Return a new config of the task on rough terrain, without a robot.
+def remove_sensors(cfg: ManagerBasedRlEnvCfg, *names: str) -> None:
+    """Remove sensors from the scene."""
+    cfg.scene.sensors = tuple(s for s in cfg.scene.sensors if s.name not in names)
 
-    It shares nothing with other configs, so that all of it may be edited. To be filled in are:
 
-    - `scene.entities["robot"]`, the frames of the sensors `terrain_scan` and `foot_height_scan`
-      and the latter's pattern, and a contact sensor `feet_ground_contact`;
-    - the action's scale; the bodies, geoms and sites of `foot_friction`, `base_com`, `upright`,
-      `body_ang_vel`, `foot_clearance` and `foot_slip`; and the standard deviations of `pose`;
-    - `viewer.body_name`.
-
-    Names of sensors and rewards left empty are refused when the environment is built. There is only
-    a warning for events, which then change nothing, and for rewards of weight 0 (here
-    `body_ang_vel` and `angular_momentum`), which are refused once they get a weight.
-    """
-    return ManagerBasedRlEnvCfg(
-        decimation=4,
-        episode_length_s=20.0,
-        scene=SceneCfg(
-            terrain=TerrainEntityCfg(
-                terrain_type="generator",
-                terrain_generator=copy.deepcopy(ROUGH_TERRAINS_CFG),
-                max_init_terrain_level=5,
-            ),
-            sensors=_sensors(),
-            num_envs=1,
-            extent=2.0,
-        ),
-        observations=_observations(),
-        actions=_actions(),
-        commands=_commands(),
-        events=_events(),
-        rewards=_rewards(),
-        terminations=_terminations(),
-        curriculum=_curriculum(),
-        metrics={"mean_action_acc": MetricsTermCfg(func=mdp.mean_action_acc)},
-        sim=SimulationCfg(
-            nconmax=35,
-            njmax=1500,
-            mujoco=MujocoCfg(timestep=0.005, iterations=10, ls_iterations=20),
-        ),
-        viewer=ViewerConfig(
-            origin_type=ViewerConfig.OriginType.ASSET_BODY,
-            entity_name="robot",
-            body_name="",
-            distance=3.0,
-            elevation=-5.0,
-        ),
-    )
+# Parts of the config.
 
 
 def _sensors() -> tuple[SensorCfg, ...]:
@@ -185,10 +190,6 @@ def _sensors() -> tuple[SensorCfg, ...]:
         ),
     )
     return terrain_scan, foot_height_scan
-
-
-def _noise(size: float) -> UniformNoiseCfg:
-    return UniformNoiseCfg(n_min=-size, n_max=size)
 
 
 def _observations() -> dict[str, ObservationGroupCfg | None]:
@@ -243,12 +244,8 @@ def _observations() -> dict[str, ObservationGroupCfg | None]:
     }
 
 
-def _actions() -> dict[str, ActionTermCfg | None]:
-    return {
-        "joint_pos": mdp.JointPositionActionCfg(
-            entity_name="robot", actuator_names=(".*",), scale=0.5, use_default_offset=True
-        )
-    }
+def _noise(size: float) -> UniformNoiseCfg:
+    return UniformNoiseCfg(n_min=-size, n_max=size)
 
 
 def _commands() -> dict[str, CommandTermCfg | None]:

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from mjlab.viewer.debug_visualizer import Color, DebugVisualizer
 
 
-# MERGED mjlab.tasks.manipulation.mdp.commands: What commands have in common that say where an object is to be brought.
-
 FIXED_GOAL = (0.4, 0.0, 0.3)
 """The goal of difficulty `fixed`, in metres from the environment's origin."""
 _GOAL_RADIUS = 0.03
@@ -218,8 +216,6 @@ class GoalCommand(CommandTerm):
             visualizer.add_sphere(goal, _GOAL_RADIUS, self._goal_color)
 
 
-# MERGED mjlab.tasks.manipulation.mdp.commands: What commands about goals refuse when they are built.
-
 _DIFFICULTIES = ("fixed", "dynamic")
 
 
@@ -254,9 +250,6 @@ def require_object(env: ManagerBasedRlEnv, name: str, label: str, is_moved: bool
             "root body a free joint."
         )
     return entity
-
-
-# MERGED mjlab.tasks.manipulation.mdp.commands: The lifting command: where one object is to be brought.
 
 
 @dataclass(kw_only=True)
@@ -335,8 +328,6 @@ class LiftingCommand(GoalCommand):
     def _goal_color(self) -> Color:
         return self.cfg.viz.target_color
 
-
-# MERGED mjlab.tasks.manipulation.mdp.commands: Placing several objects so that none is in another.
 
 logger = logging.getLogger(__name__)
 _MAX_TRIES = 200
@@ -422,8 +413,6 @@ def _warn_if_crowded(radii: list[float], within: Any, names: Sequence[str]) -> N
             list(names),
         )
 
-
-# MERGED mjlab.tasks.manipulation.mdp.commands: The lifting command of several objects: which one is wanted, and where it is to be brought.
 
 _NO_GEOM = -999
 _MARK_HEIGHT = 0.04
@@ -530,9 +519,6 @@ def _padded_geom_ids(objects: list[Entity]) -> torch.Tensor:
     """Return the scene ids of each object's geoms, (objects, G) int64."""
     ids = [torch.as_tensor(entity.indexing.geom_ids).long().cpu() for entity in objects]
     return torch.nn.utils.rnn.pad_sequence(ids, batch_first=True, padding_value=_NO_GEOM)
-
-
-# MERGED mjlab.tasks.manipulation.mdp.commands: How far an arm reaches, and whether goals lie beyond that.
 
 
 def reach(model: mujoco.MjModel, site: str) -> tuple[np.ndarray, float] | None:

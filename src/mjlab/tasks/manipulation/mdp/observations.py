@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from mjlab.tasks.manipulation.mdp.commands import GoalCommand
 
 
-# MERGED mjlab.tasks.manipulation.mdp.observations: What several terms of the manipulation tasks look up and check.
-
 C = TypeVar("C", bound="GoalCommand")
 DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 """The entity whose site terms take for the hand unless they are told."""
@@ -151,8 +149,6 @@ def check_stds(**params: Any) -> None:
         if name.endswith("std") and not value > 0.0:
             raise ValueError(f"{name} is {value!r}; it is a distance in metres above 0.")
 
-
-# MERGED mjlab.tasks.manipulation.mdp.observations: Observation terms of images. Channels come first, as networks take them: (N, C, height, width).
 
 _GEOM = int(mujoco.mjtObj.mjOBJ_GEOM)
 

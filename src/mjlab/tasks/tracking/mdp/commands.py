@@ -1,12 +1,10 @@
-"""The motion command, at its public path."""
+"""The motion command: where the robot should be now, starting it there, drawing and logging that."""
 
 from __future__ import annotations
 
 import functools
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import mujoco
@@ -16,25 +14,29 @@ import torch
 from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.lookup import Lookup
+from mjlab.managers.term_checks import check_range, require_command
 from mjlab.tasks.tracking.mdp.motion_library import (
     MotionFrame,
-    MotionLibrary,
-    MotionLoader,
     MotionReader,
+    read_library,
+)
+from mjlab.tasks.tracking.mdp.motion_library import (
+    MotionLoader as MotionLoader,
 )
 from mjlab.tasks.tracking.mdp.motion_panel import MotionPanel
-from mjlab.tasks.tracking.mdp.motion_sampling import Drawn, HardSegmentSampler, draw_uniform
-from mjlab.tasks.tracking.motion_file import check_motion_fits, read_motion
-from mjlab.tasks.tracking.motion_sources import find_motions
+from mjlab.tasks.tracking.mdp.motion_sampling import (
+    AXES,
+    Drawn,
+    HardSegmentSampler,
+    draw_uniform,
+    perturbed_start,
+)
+from mjlab.utils.errors import WrongTypeError, check_count, check_one_of, check_positive
 from mjlab.utils.indexing import as_ids, is_empty
 from mjlab.utils.lab_api.math import (
     matrix_from_quat,
     quat_error_magnitude,
-    quat_from_euler_xyz,
-    quat_mul,
-    sample_uniform,
 )
-from mjlab.utils.torch import constant_tensor
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,309 +45,29 @@ if TYPE_CHECKING:
 
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
-    from mjlab.scene import Scene
-    from mjlab.tasks.tracking.mdp.motion_library import MotionLibrary, MotionReader
     from mjlab.viewer.debug_visualizer import DebugVisualizer
-
-
-# MERGED mjlab.tasks.tracking.mdp.commands: The state in which a robot starts on a frame of a motion.
-
-AXES = ("x", "y", "z", "roll", "pitch", "yaw")
-"""What a range of poses or velocities may name."""
-
-
-def perturbed_start(
-    motion: MotionLibrary,
-    frames: torch.Tensor,
-    *,
-    pose_range: Mapping[str, tuple[float, float]],
-    velocity_range: Mapping[str, tuple[float, float]],
-    joint_position_range: tuple[float, float],
-    scale: float = 1.0,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return states on frames (n,), with uniform perturbations.
-
-    Positions and velocities are added to, p + (x, y, z) and v + (x, y, z), w + (roll, pitch, yaw);
-    orientations are turned in world axes, q_euler(roll, pitch, yaw) q. Numbers are drawn in the
-    order pose, velocity, joints, and multiplied by `scale`. The root is the first of the tracked bodies.
-
-    Returns:
-        Root states (n, 13), without origins of environments, and joint positions (n, nj).
-    """
-    count, device = len(frames), str(frames.device)
-    pos, quat, lin_vel, ang_vel = (
-        of_bodies[:, 0].index_select(0, frames)
-        for of_bodies in (
-            motion.body_pos_w, motion.body_quat_w, motion.body_lin_vel_w, motion.body_ang_vel_w
-        )
-    )  # fmt: skip
-    joint_pos = motion.joint_pos[frames]
-    pose = scale * _drawn(pose_range, count, device)
-    turn = quat_from_euler_xyz(*pose[:, 3:].unbind(1))
-    velocity = scale * _drawn(velocity_range, count, device)
-    joints = scale * sample_uniform(*joint_position_range, tuple(joint_pos.shape), device)
-    root_state = torch.cat(
-        (
-            pos + pose[:, :3],
-            quat_mul(turn, quat),
-            lin_vel + velocity[:, :3],
-            ang_vel + velocity[:, 3:],
-        ),
-        dim=1,
-    )
-    return root_state, joint_pos + joints
-
-
-def _drawn(ranges: Mapping[str, tuple[float, float]], count: int, device: str) -> torch.Tensor:
-    bounds = zip(*(ranges.get(axis, (0.0, 0.0)) for axis in AXES), strict=True)
-    low, high = (constant_tensor(side, device) for side in bounds)
-    return sample_uniform(low, high, (count, len(AXES)), device)
-
-
-# MERGED mjlab.tasks.tracking.mdp.commands: What a motion command refuses when it is built, and reading its motions.
 
 _MODES = ("adaptive", "uniform", "start")
 _DRAWINGS = ("ghost", "frames")
-
-
-def check_command_cfg(cfg: MotionCommandCfg) -> None:
-    """Raise `ValueError` for names, ranges or numbers of the config that make no sense."""
-    if len(set(cfg.body_names)) != len(cfg.body_names):
-        raise ValueError(f"body_names names a body twice: {list(cfg.body_names)}.")
-    if cfg.anchor_body_name not in cfg.body_names:
-        raise ValueError(
-            f"anchor_body_name is {cfg.anchor_body_name!r}; it has to be one of body_names, "
-            f"which are {list(cfg.body_names)}."
-        )
-    if cfg.sampling_mode not in _MODES:
-        raise ValueError(f"sampling_mode is {cfg.sampling_mode!r}; it is one of {_MODES}.")
-    if cfg.viz.mode not in _DRAWINGS:
-        raise ValueError(f"viz.mode is {cfg.viz.mode!r}; it is one of {_DRAWINGS}.")
-    for name in ("pose_range", "velocity_range"):
-        _check_ranges(name, getattr(cfg, name))
-    _check_range("joint_position_range", cfg.joint_position_range)
-    if cfg.adaptive_kernel_size < 1:
-        raise ValueError(f"adaptive_kernel_size is {cfg.adaptive_kernel_size}; 1 is the least.")
-    if not cfg.adaptive_uniform_ratio > 0.0:
-        raise ValueError(
-            f"adaptive_uniform_ratio is {cfg.adaptive_uniform_ratio}; it has to be above 0, "
-            "because without it nothing could be drawn before the first failure."
-        )
-    for name in ("adaptive_lambda", "adaptive_alpha"):
-        if not 0.0 < getattr(cfg, name) <= 1.0:
-            raise ValueError(f"{name} is {getattr(cfg, name)}; it is above 0 and at most 1.")
-
-
-def find_robot(cfg: MotionCommandCfg, scene: Scene) -> Entity:
-    """Return the robot that the config names.
-
-    Raises:
-        ValueError: there is no such entity, it has a fixed base, it lacks a tracked body, or the
-            first tracked body is not its floating base.
-    """
-    if cfg.entity_name not in scene.entities:
-        raise ValueError(
-            f"entity_name is {cfg.entity_name!r}, but the scene's entities are "
-            f"{list(scene.entities)}."
-        )
-    robot: Entity = scene[cfg.entity_name]
-    if robot.is_fixed_base:
-        raise ValueError(
-            f"Entity {cfg.entity_name!r} has a fixed base, and cannot be put onto a motion. Give "
-            "its root body a free joint."
-        )
-    missing = [name for name in cfg.body_names if name not in robot.body_names]
-    if missing:
-        raise ValueError(
-            f"body_names names {missing}, which entity {cfg.entity_name!r} lacks. Its bodies: "
-            f"{list(robot.body_names)}."
-        )
-    root = robot.body_names[0]
-    if cfg.body_names[0] != root:
-        raise ValueError(
-            f"The first of body_names is {cfg.body_names[0]!r}; it has to be the floating base "
-            f"{root!r}, because starts of episodes take its pose."
-        )
-    return robot
-
-
-def read_library(
-    motion_file: str, robot: Entity, body_indexes: torch.Tensor, step_dt: float, device: str
-) -> tuple[tuple[Path, ...], MotionLibrary]:
-    """Return the files that `motion_file` names, and their motions.
-
-    Raises:
-        MotionFileError: a file does not exist, is no motion, or is none of this robot; the
-            message says what is wrong.
-    """
-    files = tuple(find_motions(motion_file))
-    loaders = []
-    for path in files:
-        motion = read_motion(path)
-        check_motion_fits(path, motion, robot.joint_names, robot.body_names, step_dt)
-        loaders.append(MotionLoader.from_motion(motion, body_indexes, device))
-    return files, MotionLibrary(loaders, [path.stem for path in files])
-
-
-def _check_ranges(name: str, ranges: Mapping[str, Any]) -> None:
-    unknown = [axis for axis in ranges if axis not in AXES]
-    if unknown:
-        raise ValueError(f"{name} has the keys {unknown}; those there are: {list(AXES)}.")
-    for axis, bounds in ranges.items():
-        _check_range(f"{name}[{axis!r}]", bounds)
-
-
-def _check_range(label: str, bounds: Any) -> None:
-    try:
-        low, high = (float(bound) for bound in bounds)
-    except (TypeError, ValueError):
-        low, high = math.nan, math.nan
-    if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-        raise ValueError(
-            f"{label} is {bounds!r}; it has to be two finite numbers, the smaller one first."
-        )
-
-
-# MERGED mjlab.tasks.tracking.mdp.commands: How the reference is drawn: as a see-through robot, or as the frames of its bodies.
-
-
 # Lengths of the axes, in metres: of bodies and of the anchor.
 _REFERENCE_LENGTHS = (0.08, 0.1)
 _ROBOT_LENGTHS = (0.12, 0.15)
 _PASTEL = ((1.0, 0.6, 0.6), (0.6, 1.0, 0.6), (0.6, 0.6, 1.0))
 _AXIS_RADIUS = 0.008
-
 # A group of geoms that no viewer shows of a ghost.
 _HIDDEN_GROUP = 3
-
-
-class MotionDrawing:
-    """Draws the reference of a motion command."""
-
-    def __init__(self, command: MotionCommand) -> None:
-        """Take the command whose reference is drawn, with the settings in its config."""
-        self._command = command
-        self._ghost: mujoco.MjModel | None = None
-        self.offset = np.array(command.cfg.viz.ghost_offset, dtype=float)
-        """From the reference to where it is drawn, (3,), in metres; may be changed."""
-
-    def draw(self, visualizer: DebugVisualizer) -> None:
-        """Draw into `visualizer`, for the environments that it shows."""
-        indices = list(visualizer.get_env_indices(self._command.num_envs))
-        if not indices:
-            return
-        if self._command.cfg.viz.mode == "ghost":
-            self._draw_ghosts(visualizer, indices)
-        else:
-            self._draw_frames(visualizer, indices)
-
-    def _draw_ghosts(self, visualizer: DebugVisualizer, indices: Sequence[int]) -> None:
-        command, viz = self._command, self._command.cfg.viz
-        if self._ghost is None:
-            self._ghost = ghost_model(command.robot, viz.ghost_color)
-        model = self._ghost
-        frames = command.frame_indexes[indices]
-        pos = command.motion.body_pos_w[frames, 0] + command.scene.env_origins[indices]
-        root = torch.cat((pos, command.motion.body_quat_w[frames, 0]), dim=1).cpu().numpy()
-        joints = command.motion.joint_pos[frames].cpu().numpy()
-        root[:, :3] += self.offset
-        free, others = _qpos_addresses(model)
-        qpos = np.zeros(model.nq)
-        for root_pose, joint_pos in zip(root, joints, strict=True):
-            qpos[free : free + 7] = root_pose
-            qpos[others] = joint_pos
-            visualizer.add_ghost_mesh(qpos, model, alpha=viz.ghost_color[3])
-
-    def _draw_frames(self, visualizer: DebugVisualizer, indices: Sequence[int]) -> None:
-        command = self._command
-        for pos, quat, lengths, colors, shift in (
-            (command.body_pos_w, command.body_quat_w, _REFERENCE_LENGTHS, _PASTEL, self.offset),
-            (command.robot_body_pos_w, command.robot_body_quat_w, _ROBOT_LENGTHS, None, 0.0),
-        ):
-            places = pos[indices].cpu().numpy() + shift
-            axes = matrix_from_quat(quat[indices]).cpu().numpy()
-            for body in range(places.shape[1]):
-                length = lengths[body == command.anchor_index]
-                for place, rotation in zip(places[:, body], axes[:, body], strict=True):
-                    visualizer.add_frame(
-                        place,
-                        rotation,
-                        scale=length,
-                        axis_radius=_AXIS_RADIUS,
-                        axis_colors=colors,
-                    )
-
-
-def ghost_model(robot: Any, color: tuple[float, float, float, float]) -> mujoco.MjModel:
-    """Return a model of the robot in one colour, without its collision shapes if it has others.
-
-    It is of the robot alone, so that nothing else in the scene gets a ghost.
-    """
-    # Built anew, because the robot's own spec has become part of the scene's.
-    model = robot.cfg.build().compile()
-    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    model.geom_matid[:] = -1
-    model.geom_rgba[:] = color
-    if not collides.all():
-        model.geom_group[collides] = _HIDDEN_GROUP
-    return model
-
-
-def _qpos_addresses(model: mujoco.MjModel) -> tuple[int, np.ndarray]:
-    """Return where in qpos the free joint begins, and where the other joints are, in order."""
-    is_free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
-    return int(model.jnt_qposadr[is_free][0]), model.jnt_qposadr[~is_free]
-
-
-# MERGED mjlab.tasks.tracking.mdp.commands: What the motion command logs of every episode: how far robot and reference are apart.
-
-
-def tracking_metrics(motion: MotionReader) -> dict[str, torch.Tensor]:
-    """Return errors by name, (N,) each.
-
-    Those of positions and velocities are Euclidean norms (m, m/s, rad/s), those of orientations
-    angles (rad), those of bodies means over the tracked bodies, and those of joints the norm over
-    all joints (rad, rad/s). Poses of bodies are compared with the relative ones; velocities are in
-    world axes.
-    """
-    anchor = motion.anchor_index
-    pos, quat = motion.robot_body_pos_w, motion.robot_body_quat_w
-    # (3, N, K): of positions and both velocities.
-    norms = _norm(
-        torch.stack(
-            (
-                motion.body_pos_relative_w - pos,
-                motion.body_lin_vel_w - motion.robot_body_lin_vel_w,
-                motion.body_ang_vel_w - motion.robot_body_ang_vel_w,
-            )
-        )
-    )
-    mean_pos, mean_lin_vel, mean_ang_vel = norms.mean(dim=2)
-    body_rot = quat_error_magnitude(motion.body_quat_relative_w, quat)
-    return {
-        "error_anchor_pos": _norm(motion.anchor_pos_w - pos[:, anchor]),
-        "error_anchor_rot": quat_error_magnitude(motion.anchor_quat_w, quat[:, anchor]),
-        "error_anchor_lin_vel": norms[1, :, anchor],
-        "error_anchor_ang_vel": norms[2, :, anchor],
-        "error_body_pos": mean_pos,
-        "error_body_rot": body_rot.mean(dim=1),
-        "error_body_lin_vel": mean_lin_vel,
-        "error_body_ang_vel": mean_ang_vel,
-        "error_joint_pos": (motion.joint_pos - motion.robot_joint_pos).norm(dim=-1),
-        "error_joint_vel": (motion.joint_vel - motion.robot_joint_vel).norm(dim=-1),
-    }
-
-
-def _norm(vectors: torch.Tensor) -> torch.Tensor:
-    """Return Euclidean norms of (..., 3) vectors."""
-    # By components: a reduction over three numbers takes a CPU twice as long.
-    x, y, z = vectors.unbind(-1)
-    return (x * x).addcmul_(y, y).addcmul_(z, z).sqrt_()
-
-
-# MERGED mjlab.tasks.tracking.mdp.commands: The motion command: where the robot should be now, and starting it there.
-
 _SAMPLING_METRICS = ("sampling_entropy", "sampling_top1_prob", "sampling_top1_bin")
+# What terms read of a command, whose class may be a package's own.
+_READ = (
+    "anchor_pos_w",
+    "anchor_quat_w",
+    "robot_anchor_pos_w",
+    "robot_anchor_quat_w",
+    "body_pos_relative_w",
+    "body_quat_relative_w",
+    "robot_body_pos_w",
+    "robot_body_quat_w",
+)
 
 
 @dataclass(kw_only=True)
@@ -440,7 +162,7 @@ class MotionCommand(MotionReader, CommandTerm):
         super().__init__(cfg, env)
         check_command_cfg(cfg)
         self.scene = env.scene
-        self.robot: Entity = find_robot(cfg, env.scene)
+        self.robot: Entity = find_robot(cfg, env)
         self.body_names = tuple(cfg.body_names)
         self.anchor_index = self.body_names.index(cfg.anchor_body_name)
         indexes = [self.robot.body_names.index(name) for name in self.body_names]
@@ -700,7 +422,25 @@ class MotionCommand(MotionReader, CommandTerm):
         request_action: Callable[[str, Any], None] | None = None,
     ) -> None:
         """Add the frame slider, the button that starts there, and the errors of the bodies."""
-        self._panel = MotionPanel(self, name, server, get_env_idx, on_change, request_action)
+
+        def set_frame(env: int, motion: int, frame: int) -> None:
+            self.motion_ids[env], self.time_steps[env] = motion, frame
+            self.update_relative_body_poses()
+
+        self._panel = MotionPanel(
+            name,
+            server,
+            self.motion,
+            self.num_envs,
+            self.drawing.offset,
+            get_env_idx=get_env_idx,
+            get_frame=lambda env: (int(self.motion_ids[env]), int(self.time_steps[env])),
+            set_frame=set_frame,
+            get_matching=lambda: self.matching_frame,
+            get_current=lambda: MotionFrame(self, self.frame_indexes),
+            on_change=on_change,
+            request_action=request_action,
+        )
 
     def on_viewer_pause(self, paused: bool) -> None:
         """Let the frame slider move the reference while the viewer is paused."""
@@ -724,20 +464,7 @@ class MotionCommand(MotionReader, CommandTerm):
         return True
 
 
-# MERGED mjlab.tasks.tracking.mdp.commands: Finding the command of a term and the bodies it looks at, with checks for when it is built.
-
-
-# What terms read of a command, whose class may be a package's own.
-_READ = (
-    "anchor_pos_w",
-    "anchor_quat_w",
-    "robot_anchor_pos_w",
-    "robot_anchor_quat_w",
-    "body_pos_relative_w",
-    "body_quat_relative_w",
-    "robot_body_pos_w",
-    "robot_body_quat_w",
-)
+# Terms that read a motion command.
 
 
 def motion_command(env: ManagerBasedRlEnv, command_name: str) -> MotionCommand:
@@ -762,27 +489,22 @@ def check_motion_term(
             `std` or `threshold` is not positive.
         TypeError: the command lacks what a `MotionCommand` has.
     """
-    names = env.command_manager.active_terms
-    if command_name not in names:
-        raise ValueError(f"There is no command {command_name!r}. There are: {list(names)}.")
-    manager: Any = env.command_manager
-    command = manager.get_term(command_name)
-    missing = [] if isinstance(command, MotionCommand) else _missing(command)
+    require_command(env, command_name)
+    command: Any = motion_command(env, command_name)
+    missing: list[str] = []
+    if not isinstance(command, MotionCommand):
+        # Listed rather than read: before the first reset, a property may have nothing to return.
+        missing = sorted(set(_READ) - set(dir(command)))
+        missing += [] if hasattr(command.cfg, "body_names") else ["cfg.body_names"]
     if missing:
-        raise TypeError(
+        raise WrongTypeError(
             f"Command {command_name!r}: expected a MotionCommand or a term with its attributes, got "
             f"a {type(command).__name__} without {', '.join(missing)}."
         )
     body_columns(command, body_names)
-    for label, value in (("std", std), ("threshold", threshold)):
-        if value is not None and not value > 0.0:
-            raise ValueError(f"{label} is {value!r}; it has to be positive.")
-
-
-def _missing(command: Any) -> list[str]:
-    # Listed rather than read: before the first reset, a property may have nothing to return.
-    missing = sorted(set(_READ) - set(dir(command)))
-    return missing if hasattr(command.cfg, "body_names") else [*missing, "cfg.body_names"]
+    for name, value in (("std", std), ("threshold", threshold)):
+        if value is not None:
+            check_positive(name, value)
 
 
 def body_columns(command: MotionReader, body_names: tuple[str, ...] | None) -> slice | torch.Tensor:
@@ -806,6 +528,188 @@ def _columns_of(body_names: tuple[str, ...], tracked: tuple[str, ...], device: s
         raise ValueError(f"body_names names {what}. The command tracks {list(tracked)}.")
     columns = [i for i, name in enumerate(tracked) if name in body_names]
     return torch.tensor(columns, device=device)
+
+
+# Building: checks of the config and the robot.
+
+
+def check_command_cfg(cfg: MotionCommandCfg) -> None:
+    """Raise `ValueError` for names, ranges or numbers of the config that make no sense."""
+    if len(set(cfg.body_names)) != len(cfg.body_names):
+        raise ValueError(f"body_names names a body twice: {list(cfg.body_names)}.")
+    if cfg.anchor_body_name not in cfg.body_names:
+        raise ValueError(
+            f"anchor_body_name is {cfg.anchor_body_name!r}; it has to be one of body_names, "
+            f"which are {list(cfg.body_names)}."
+        )
+    check_one_of("sampling_mode", cfg.sampling_mode, _MODES)
+    check_one_of("viz.mode", cfg.viz.mode, _DRAWINGS)
+    for name in ("pose_range", "velocity_range"):
+        for axis, bounds in getattr(cfg, name).items():
+            check_one_of(f"key of {name}", axis, AXES)
+            check_range(f"{name}[{axis!r}]", bounds)
+    check_range("joint_position_range", cfg.joint_position_range)
+    check_count("adaptive_kernel_size", cfg.adaptive_kernel_size)
+    # Without it nothing could be drawn before the first failure.
+    check_positive("adaptive_uniform_ratio", cfg.adaptive_uniform_ratio)
+    for name in ("adaptive_lambda", "adaptive_alpha"):
+        if not 0.0 < getattr(cfg, name) <= 1.0:
+            raise ValueError(f"{name} is {getattr(cfg, name)}; it is above 0 and at most 1.")
+
+
+def find_robot(cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> Entity:
+    """Return the robot that the config names.
+
+    Raises:
+        ValueError: there is no such entity, it has a fixed base, it lacks a tracked body, or the
+            first tracked body is not its floating base.
+    """
+    if cfg.entity_name not in env.scene.entities:
+        raise ValueError(
+            f"entity_name is {cfg.entity_name!r}, but the scene's entities are "
+            f"{list(env.scene.entities)}."
+        )
+    robot: Entity = env.scene[cfg.entity_name]
+    if robot.is_fixed_base:
+        raise ValueError(
+            f"Entity {cfg.entity_name!r} has a fixed base, and cannot be put onto a motion. Give "
+            "its root body a free joint."
+        )
+    missing = [name for name in cfg.body_names if name not in robot.body_names]
+    if missing:
+        raise ValueError(
+            f"body_names names {missing}, which entity {cfg.entity_name!r} lacks. Its bodies: "
+            f"{list(robot.body_names)}."
+        )
+    root = robot.body_names[0]
+    if cfg.body_names[0] != root:
+        raise ValueError(
+            f"The first of body_names is {cfg.body_names[0]!r}; it has to be the floating base "
+            f"{root!r}, because starts of episodes take its pose."
+        )
+    return robot
+
+
+# Drawing.
+
+
+class MotionDrawing:
+    """Draws the reference of a motion command."""
+
+    def __init__(self, command: MotionCommand) -> None:
+        """Take the command whose reference is drawn, with the settings in its config."""
+        self._command = command
+        self._ghost: mujoco.MjModel | None = None
+        self.offset = np.array(command.cfg.viz.ghost_offset, dtype=float)
+        """From the reference to where it is drawn, (3,), in metres; may be changed."""
+
+    def draw(self, visualizer: DebugVisualizer) -> None:
+        """Draw into `visualizer`, for the environments that it shows."""
+        indices = list(visualizer.get_env_indices(self._command.num_envs))
+        if not indices:
+            return
+        if self._command.cfg.viz.mode == "ghost":
+            self._draw_ghosts(visualizer, indices)
+        else:
+            self._draw_frames(visualizer, indices)
+
+    def _draw_ghosts(self, visualizer: DebugVisualizer, indices: Sequence[int]) -> None:
+        command, viz = self._command, self._command.cfg.viz
+        if self._ghost is None:
+            self._ghost = ghost_model(command.robot, viz.ghost_color)
+        model = self._ghost
+        frames = command.frame_indexes[indices]
+        pos = command.motion.body_pos_w[frames, 0] + command.scene.env_origins[indices]
+        root = torch.cat((pos, command.motion.body_quat_w[frames, 0]), dim=1).cpu().numpy()
+        joints = command.motion.joint_pos[frames].cpu().numpy()
+        root[:, :3] += self.offset
+        is_free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+        free, others = int(model.jnt_qposadr[is_free][0]), model.jnt_qposadr[~is_free]
+        qpos = np.zeros(model.nq)
+        for root_pose, joint_pos in zip(root, joints, strict=True):
+            qpos[free : free + 7] = root_pose
+            qpos[others] = joint_pos
+            visualizer.add_ghost_mesh(qpos, model, alpha=viz.ghost_color[3])
+
+    def _draw_frames(self, visualizer: DebugVisualizer, indices: Sequence[int]) -> None:
+        command = self._command
+        for pos, quat, lengths, colors, shift in (
+            (command.body_pos_w, command.body_quat_w, _REFERENCE_LENGTHS, _PASTEL, self.offset),
+            (command.robot_body_pos_w, command.robot_body_quat_w, _ROBOT_LENGTHS, None, 0.0),
+        ):
+            places = pos[indices].cpu().numpy() + shift
+            axes = matrix_from_quat(quat[indices]).cpu().numpy()
+            for body in range(places.shape[1]):
+                length = lengths[body == command.anchor_index]
+                for place, rotation in zip(places[:, body], axes[:, body], strict=True):
+                    visualizer.add_frame(
+                        place,
+                        rotation,
+                        scale=length,
+                        axis_radius=_AXIS_RADIUS,
+                        axis_colors=colors,
+                    )
+
+
+def ghost_model(robot: Any, color: tuple[float, float, float, float]) -> mujoco.MjModel:
+    """Return a model of the robot in one colour, without its collision shapes if it has others.
+
+    It is of the robot alone, so that nothing else in the scene gets a ghost.
+    """
+    # Built anew, because the robot's own spec has become part of the scene's.
+    model = robot.cfg.build().compile()
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    model.geom_matid[:] = -1
+    model.geom_rgba[:] = color
+    if not collides.all():
+        model.geom_group[collides] = _HIDDEN_GROUP
+    return model
+
+
+# Errors that are logged in every episode.
+
+
+def tracking_metrics(motion: MotionReader) -> dict[str, torch.Tensor]:
+    """Return errors by name, (N,) each.
+
+    Those of positions and velocities are Euclidean norms (m, m/s, rad/s), those of orientations
+    angles (rad), those of bodies means over the tracked bodies, and those of joints the norm over
+    all joints (rad, rad/s). Poses of bodies are compared with the relative ones; velocities are in
+    world axes.
+    """
+    anchor = motion.anchor_index
+    pos, quat = motion.robot_body_pos_w, motion.robot_body_quat_w
+    # (3, N, K): of positions and both velocities.
+    norms = _norm(
+        torch.stack(
+            (
+                motion.body_pos_relative_w - pos,
+                motion.body_lin_vel_w - motion.robot_body_lin_vel_w,
+                motion.body_ang_vel_w - motion.robot_body_ang_vel_w,
+            )
+        )
+    )
+    mean_pos, mean_lin_vel, mean_ang_vel = norms.mean(dim=2)
+    body_rot = quat_error_magnitude(motion.body_quat_relative_w, quat)
+    return {
+        "error_anchor_pos": _norm(motion.anchor_pos_w - pos[:, anchor]),
+        "error_anchor_rot": quat_error_magnitude(motion.anchor_quat_w, quat[:, anchor]),
+        "error_anchor_lin_vel": norms[1, :, anchor],
+        "error_anchor_ang_vel": norms[2, :, anchor],
+        "error_body_pos": mean_pos,
+        "error_body_rot": body_rot.mean(dim=1),
+        "error_body_lin_vel": mean_lin_vel,
+        "error_body_ang_vel": mean_ang_vel,
+        "error_joint_pos": (motion.joint_pos - motion.robot_joint_pos).norm(dim=-1),
+        "error_joint_vel": (motion.joint_vel - motion.robot_joint_vel).norm(dim=-1),
+    }
+
+
+def _norm(vectors: torch.Tensor) -> torch.Tensor:
+    """Return Euclidean norms of (..., 3) vectors."""
+    # By components: a reduction over three numbers takes a CPU twice as long.
+    x, y, z = vectors.unbind(-1)
+    return (x * x).addcmul_(y, y).addcmul_(z, z).sqrt_()
 
 
 __getattr__ = older_names(__name__)

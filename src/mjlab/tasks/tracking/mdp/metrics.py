@@ -2,6 +2,11 @@
 
 Each function takes a motion command, or one of its frames (`MotionCommand.matching_frame`), and
 returns a value for each environment.
+
+In evaluations every environment plays one motion once, from its first frame. Errors are those of the states in
+which the policy acts, the perturbed start among them: each is compared with the frame of its own
+time, and relative poses are those of the same time too. So no state after a reset is ever compared
+with the frame before it.
 """
 
 from __future__ import annotations
@@ -11,12 +16,17 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.managers import TerminationTermCfg
-from mjlab.tasks.tracking.mdp.commands import MotionCommand, MotionCommandCfg, body_columns
+from mjlab.tasks.tracking.mdp.commands import MotionCommandCfg, body_columns
 from mjlab.tasks.tracking.mdp.terminations import motion_ended
 from mjlab.utils.lab_api.math import quat_error_magnitude
 
 if TYPE_CHECKING:
-    from mjlab.tasks.tracking.mdp.motion_library import MotionReader
+    from mjlab.tasks.tracking.mdp.motion_library import MotionFrame, MotionReader
+
+_COMMAND = "motion"
+_END_EFFECTORS = "ee_body_pos"
+_END = "motion_ended"
+_LONGER_THAN_MOTIONS_S = 3600.0
 
 
 def compute_mpkpe(command: MotionReader) -> torch.Tensor:
@@ -70,42 +80,43 @@ def _distance(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
     return torch.linalg.vector_norm(one - other, dim=-1)
 
 
-# MERGED mjlab.tasks.tracking.mdp.metrics: What evaluations of motion tracking measure, and the environments that they measure it in.
-#
-# Every environment plays one motion once, from its first frame. Errors are those of the states in
-# which the policy acts, the perturbed start among them: each is compared with the frame of its own
-# time, and relative poses are those of the same time too. So no state after a reset is ever compared
-# with the frame before it.
-
-_COMMAND = "motion"
-_END_EFFECTORS = "ee_body_pos"
-_END = "motion_ended"
-_LONGER_THAN_MOTIONS_S = 3600.0
+# What evaluations measure, and the environments that they measure it in.
 
 
 def mpkpe(env: Any) -> torch.Tensor:
     """Return the mean distance of the tracked bodies to the reference in the world (m), (N,)."""
-    return compute_mpkpe(_command(env).matching_frame)
+    return compute_mpkpe(_frame(env))
 
 
 def r_mpkpe(env: Any) -> torch.Tensor:
     """Return the same with the reference carried to the robot's place and heading (m), (N,)."""
-    return compute_root_relative_mpkpe(_command(env).matching_frame)
+    return compute_root_relative_mpkpe(_frame(env))
 
 
 def joint_vel_error(env: Any) -> torch.Tensor:
     """Return the root mean square over joints of the velocity error (rad/s), (N,)."""
-    return compute_joint_velocity_error(_command(env).matching_frame)
+    return compute_joint_velocity_error(_frame(env))
 
 
 def ee_pos_error(env: Any) -> torch.Tensor:
     """Return the mean distance of hands and feet to the relative reference (m), (N,)."""
-    return compute_ee_position_error(_command(env).matching_frame, _end_effectors(env))
+    return compute_ee_position_error(_frame(env), _end_effectors(env))
 
 
 def ee_ori_error(env: Any) -> torch.Tensor:
     """Return the mean angle of hands and feet to the relative reference (rad), (N,)."""
-    return compute_ee_orientation_error(_command(env).matching_frame, _end_effectors(env))
+    return compute_ee_orientation_error(_frame(env), _end_effectors(env))
+
+
+def _frame(env: Any) -> MotionFrame:
+    return env.command_manager.get_term(_COMMAND).matching_frame
+
+
+def _end_effectors(env: Any) -> tuple[str, ...]:
+    manager = env.termination_manager
+    if _END_EFFECTORS not in manager.active_terms:
+        return ()
+    return tuple(manager.get_term_cfg(_END_EFFECTORS).params.get("body_names") or ())
 
 
 TRACKING_ERRORS = {
@@ -133,14 +144,3 @@ def play_motions_once(cfg: Any) -> None:
     )
     # The motion is to end the episode, and not the clock. Which motion it will be is not known yet.
     cfg.episode_length_s = max(cfg.episode_length_s, _LONGER_THAN_MOTIONS_S)
-
-
-def _command(env: Any) -> MotionCommand:
-    return env.command_manager.get_term(_COMMAND)
-
-
-def _end_effectors(env: Any) -> tuple[str, ...]:
-    manager = env.termination_manager
-    if _END_EFFECTORS not in manager.active_terms:
-        return ()
-    return tuple(manager.get_term_cfg(_END_EFFECTORS).params.get("body_names") or ())

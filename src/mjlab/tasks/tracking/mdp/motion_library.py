@@ -1,4 +1,4 @@
-"""TODO."""
+"""Motions as tensors on the device, and frames of them beside the robot, which errors are computed from."""
 
 from __future__ import annotations
 
@@ -8,15 +8,19 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from mjlab.tasks.tracking.motion_file import Motion, MotionFileError, read_motion
+from mjlab.tasks.tracking.motion_file import (
+    Motion,
+    MotionFileError,
+    check_motion_fits,
+    read_motion,
+)
+from mjlab.tasks.tracking.motion_sources import find_motions
 from mjlab.utils.lab_api.math import quat_inv, quat_mul, yaw_quat
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.scene import Scene
 
-
-# MERGED mjlab.tasks.tracking.mdp.motion_library: Motions as tensors on the device, ready to be read by frame.
 
 _PER_BODY = ("body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w")
 _PER_JOINT = ("joint_pos", "joint_vel")
@@ -116,7 +120,22 @@ class MotionLibrary:
         return len(self.names)
 
 
-# MERGED mjlab.tasks.tracking.mdp.motion_library: The reference beside the robot, under the names that errors are computed from.
+def read_library(
+    motion_file: str, robot: Entity, body_indexes: torch.Tensor, step_dt: float, device: str
+) -> tuple[tuple[Path, ...], MotionLibrary]:
+    """Return the files that `motion_file` names, and their motions.
+
+    Raises:
+        MotionFileError: a file does not exist, is no motion, or is none of this robot; the
+            message says what is wrong.
+    """
+    files = tuple(find_motions(motion_file))
+    loaders = []
+    for path in files:
+        motion = read_motion(path)
+        check_motion_fits(path, motion, robot.joint_names, robot.body_names, step_dt)
+        loaders.append(MotionLoader.from_motion(motion, body_indexes, device))
+    return files, MotionLibrary(loaders, [path.stem for path in files])
 
 
 class MotionReader:

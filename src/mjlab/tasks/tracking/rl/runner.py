@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from mjlab.tasks.tracking.mdp.motion_library import MotionLibrary
 
 
-# MERGED mjlab.tasks.tracking.rl.runner: The exported policy together with the reference that it follows.
-
 REFERENCE = (
     "joint_pos",
     "joint_vel",

@@ -74,22 +74,10 @@ def terrain_levels_vel(
     Returns, to be logged: mean and largest level, and the mean level of each kind of terrain where
     each has its own column.
     """
-    terrain = env.scene.terrain
+    terrain: Any = env.scene.terrain
     if terrain is None or terrain.terrain_origins is None:
         return {}
-    _move(env, env_ids, command_name, asset_cfg, use_elapsed_time)
-    return _levels_to_log(terrain)
-
-
-def _move(
-    env: ManagerBasedRlEnv,
-    env_ids: torch.Tensor,
-    command_name: str,
-    asset_cfg: SceneEntityCfg,
-    use_elapsed_time: bool,
-) -> None:
     asset: Entity = env.scene[asset_cfg.name]
-    terrain: Any = env.scene.terrain
     offset = asset.data.root_link_pos_w[env_ids, :2] - env.scene.env_origins[env_ids, :2]
     distance = torch.linalg.vector_norm(offset, dim=1)
     command = velocity_command(env, command_name)[env_ids]
@@ -103,6 +91,7 @@ def _move(
     # At the first reset robots are wherever the model puts them.
     has_moved = env.episode_length_buf[env_ids] > (0 if env.common_step_counter > 0 else torch.inf)
     terrain.update_env_origins(env_ids, move_up & has_moved, move_down & has_moved)
+    return _levels_to_log(terrain)
 
 
 def _levels_to_log(terrain: Any) -> dict[str, torch.Tensor]:
@@ -133,7 +122,7 @@ def _check_stages(
         for key, bounds in stage.items():
             if key != "step" and key not in RANGES:
                 raise ValueError(
-                    f"velocity_stages: the stage of step {stage['step']} has {key!r}. "
+                    f"velocity_stages: the stage of step {stage['step']} has {key!r}; "
                     f"{suggest(key, RANGES)}"
                 )
             if key != "step" and bounds is not None:

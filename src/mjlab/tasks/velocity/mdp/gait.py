@@ -15,10 +15,10 @@ import torch
 
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.managers.term_checks import checked_when_built, require_command, require_sensor
-from mjlab.sensor import TerrainHeightSensor
-from mjlab.tasks.velocity.mdp.observations import check_height_sensor
+from mjlab.managers.term_checks import checked_when_built, require_command
+from mjlab.tasks.velocity.mdp.observations import height_columns
 from mjlab.tasks.velocity.mdp.rewards import command_speed, values_of_joints
+from mjlab.utils.errors import check_positive
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import quat_apply_inverse
 from mjlab.utils.string import suggest
@@ -78,8 +78,7 @@ class GaitClockCommand(CommandTerm):
 
     def __init__(self, cfg: GaitClockCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
-        if not cfg.frequency > 0.0:
-            raise ValueError(f"frequency: expected a positive number (Hz), got {cfg.frequency!r}.")
+        check_positive("frequency", cfg.frequency)
         if not 0.0 <= cfg.fade_s < math.inf:
             raise ValueError(f"fade_s: expected a time of at least 0 s, got {cfg.fade_s!r}.")
         starts = cfg.starts
@@ -191,16 +190,13 @@ def _check_height_by_phase(
     **_: Any,
 ) -> None:
     require_gait_clock(env, command_name)
-    check_height_sensor(env, height_sensor_name)
-    frame = require_sensor(env, height_sensor_name, TerrainHeightSensor).cfg.frame
-    feet = [ref.name for ref in (frame if isinstance(frame, tuple) else (frame,))]
+    feet = [name for name, _ in height_columns(env, height_sensor_name)]
     if len(offsets) != len(feet):
         raise ValueError(
             f"offsets: expected one number for each foot of {height_sensor_name!r}, {feet}, got "
             f"{offsets}; use (0, 0.5) for two feet, and (0, 0.5, 0.5, 0) for the trot of four."
         )
-    if not variance > 0.0:
-        raise ValueError(f"variance: expected a positive number (m^2), got {variance!r}.")
+    check_positive("variance", variance)
 
 
 @checked_when_built(_check_height_by_phase)

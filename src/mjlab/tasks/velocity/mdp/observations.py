@@ -17,20 +17,6 @@ if TYPE_CHECKING:
     from mjlab.managers.scene_entity_config import SceneEntityCfg
 
 
-# MERGED mjlab.tasks.velocity.mdp.observations: What the terms of a walking robot ask of its sensors, checked when they are built.
-
-
-def check_builtin_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
-    """Check a term that reads a MuJoCo sensor of three numbers."""
-    sensor = require_sensor(env, sensor_name, BuiltinSensor)
-    size = sensor.data.shape[-1]
-    if size != 3:
-        raise ValueError(
-            f"The sensor {sensor_name!r} has {size} values; one of 3 is needed, such as a "
-            "subtreeangmom sensor."
-        )
-
-
 def check_found_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
     """Check a term that asks whether there is contact."""
     require_fields(require_sensor(env, sensor_name, ContactSensor), "found")
@@ -59,6 +45,38 @@ def check_height_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> N
         )
 
 
+@accepts_older_params
+@checked_when_built(check_height_sensor)
+def foot_height(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
+    """Height of each foot above the ground (m), (N, feet), from a height sensor."""
+    return env.scene[sensor_name].data.heights
+
+
+@checked_when_built(check_air_time_sensor)
+def foot_air_time(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
+    """Time that each foot has been in the air (s), (N, feet); 0 on the ground."""
+    return env.scene[sensor_name].data.current_air_time
+
+
+@checked_when_built(check_found_sensor)
+def foot_contact(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
+    """1 for each foot that touches the ground, else 0, (N, feet)."""
+    return (env.scene[sensor_name].data.found > 0).float()
+
+
+@checked_when_built(check_force_sensor)
+def foot_contact_forces(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
+    """Contact forces as `sign(f) ln(1 + |f|)`, (N, 3 feet): x, y, z of the first foot, and so on.
+
+    The logarithm brings standing (some 30 N a foot) and landing (some 1000 N) to one scale.
+    """
+    force = env.scene[sensor_name].data.force.flatten(start_dim=1)
+    return torch.copysign(torch.log1p(force.abs()), force)
+
+
+# Checks of further terms, for when they are built.
+
+
 def check_feet_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
     """Check a term that reads one contact for each foot."""
     sensor = require_sensor(env, sensor_name, ContactSensor)
@@ -71,14 +89,19 @@ def check_feet_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> Non
     require_fields(sensor, "found")
 
 
-def check_landing_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
-    """Check a term that reads the force with which feet land."""
-    check_air_time_sensor(env, sensor_name)
-    check_feet_sensor(env, sensor_name)
-    check_force_sensor(env, sensor_name)
+def check_builtin_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
+    """Check a term that reads a MuJoCo sensor of three numbers."""
+    sensor = require_sensor(env, sensor_name, BuiltinSensor)
+    size = sensor.data.shape[-1]
+    if size != 3:
+        raise ValueError(
+            f"The sensor {sensor_name!r} has {size} values; one of 3 is needed, such as a "
+            "subtreeangmom sensor."
+        )
 
 
 # Feet: columns of different sources that are multiplied with each other.
+
 
 # What a source is called in messages, and name and body of each of its columns.
 Source = tuple[str, list[tuple[str, int]]]
@@ -148,35 +171,6 @@ def _is_within(model: mujoco.MjModel, body: int, tree: int) -> bool:
     while body > 0 and body != tree:
         body = int(model.body_parentid[body])
     return body == tree
-
-
-@accepts_older_params
-@checked_when_built(check_height_sensor)
-def foot_height(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
-    """Height of each foot above the ground (m), (N, feet), from a height sensor."""
-    return env.scene[sensor_name].data.heights
-
-
-@checked_when_built(check_air_time_sensor)
-def foot_air_time(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
-    """Time that each foot has been in the air (s), (N, feet); 0 on the ground."""
-    return env.scene[sensor_name].data.current_air_time
-
-
-@checked_when_built(check_found_sensor)
-def foot_contact(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
-    """1 for each foot that touches the ground, else 0, (N, feet)."""
-    return (env.scene[sensor_name].data.found > 0).float()
-
-
-@checked_when_built(check_force_sensor)
-def foot_contact_forces(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
-    """Contact forces as `sign(f) ln(1 + |f|)`, (N, 3 feet): x, y, z of the first foot, and so on.
-
-    The logarithm brings standing (some 30 N a foot) and landing (some 1000 N) to one scale.
-    """
-    force = env.scene[sensor_name].data.force.flatten(start_dim=1)
-    return torch.copysign(torch.log1p(force.abs()), force)
 
 
 __getattr__ = older_names(__name__)

@@ -3,6 +3,9 @@
 Derived quantities (velocities of links, orientations, contacts) are one physics substep old here,
 and what rays see is one environment step old; `ManagerBasedRlEnv.step` says why. A command is the
 one that the policy saw.
+
+Terms about feet multiply columns of different sources (contacts, heights, sites) with each other, so that
+all of them have to list the feet in one order. That is checked when the terms are built.
 """
 
 from __future__ import annotations
@@ -27,13 +30,14 @@ from mjlab.tasks.velocity.mdp.observations import (
     check_air_time_sensor,
     check_builtin_sensor,
     check_feet_sensor,
-    check_landing_sensor,
+    check_force_sensor,
     check_same_feet,
     contact_columns,
     height_columns,
     site_columns,
 )
 from mjlab.tasks.velocity.mdp.terrain_utils import terrain_normal_from_sensors
+from mjlab.utils.errors import check_positive
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
 from mjlab.utils.lab_api.string import resolve_matching_names_values
@@ -42,375 +46,9 @@ if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.managers.reward_manager import RewardTermCfg
-    from mjlab.managers.scene_entity_config import SceneEntityCfg
     from mjlab.viewer.debug_visualizer import DebugVisualizer
 
-
-# MERGED mjlab.tasks.velocity.mdp.rewards: What several terms of the velocity task compute.
-
-
-def velocity_command(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
-    """Return a velocity command (vx, vy, wz) in the frame of the root, (N, 3)."""
-    # That it exists was checked when the term was built.
-    manager: Any = env.command_manager
-    return manager.get_command(command_name)
-
-
-def command_speed(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
-    """Return `|c_xy| + |c_z|` of a velocity command, (N,): how much motion is asked for."""
-    command = velocity_command(env, command_name)
-    return torch.linalg.vector_norm(command[:, :2], dim=1).add_(command[:, 2].abs())
-
-
-def if_commanded(
-    cost: torch.Tensor, env: ManagerBasedRlEnv, command_name: str | None, threshold: float
-) -> torch.Tensor:
-    """Return `cost` (N,), and 0 where the command asks for no more motion than `threshold`.
-
-    Without a command's name, `cost` is returned as it is.
-    """
-    if command_name is None:
-        return cost
-    return torch.where(command_speed(env, command_name) > threshold, cost, 0.0)
-
-
-def log_metric(env: ManagerBasedRlEnv, name: str, value: torch.Tensor) -> None:
-    """Log one number of this step under `Metrics/<name>`."""
-    env.extras.setdefault("log", {})[f"Metrics/{name}"] = value
-
-
-def masked_mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-    """Return the mean of the finite values where `mask` is true, as one number; 0 if there are none."""
-    # `isfinite` takes twice the operations.
-    mask = mask & (values.abs() < torch.inf)
-    return torch.where(mask, values, 0.0).sum() / mask.sum().clamp(min=1)
-
-
-def tilt_of(quat: torch.Tensor) -> torch.Tensor:
-    """Return the squared horizontal part of "up" in frames of orientation (N, 4): sin(tilt)^2, (N,).
-
-    With x and y of a unit quaternion, that of the third row of its rotation matrix is
-    `4 s (1 - s)`, where s = x^2 + y^2.
-    """
-    x, y = quat[:, 1], quat[:, 2]
-    share = x * x + y * y
-    return 4.0 * share * (1.0 - share)
-
-
-def single_body(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> int | None:
-    """Return the index of the selected body, or None for the root where none is selected.
-
-    Raises:
-        ValueError: several bodies are selected; the message names them.
-    """
-    ids: Any = asset_cfg.body_ids
-    entity: Entity = env.scene[asset_cfg.name]
-    if isinstance(ids, slice) and asset_cfg.body_names is None:
-        return None
-    chosen = list(range(entity.num_bodies))[ids] if isinstance(ids, slice) else list(ids)
-    if len(chosen) != 1:
-        names = [entity.body_names[i] for i in chosen]
-        raise ValueError(
-            f"asset_cfg selects the bodies {names} of entity {asset_cfg.name!r}; exactly one is "
-            f"needed, or no body_names for the root {entity.body_names[0]!r}."
-        )
-    return int(chosen[0])
-
-
-def values_of_joints(
-    joints: list[str],
-    name: str,
-    table: dict[str, float],
-    *,
-    above: float = -math.inf,
-    least: float = -math.inf,
-) -> list[float]:
-    """Return the value of each joint, of the parameter `name`, a table of patterns and values.
-
-    Raises:
-        ValueError: a joint matches no pattern or several, a pattern matches no joint, or a value is
-            not `above` a bound or less than the `least`.
-    """
-    try:
-        _, covered, values = resolve_matching_names_values(table, joints)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
-    missing = [joint for joint in joints if joint not in covered]
-    if missing:
-        raise ValueError(
-            f"{name} has no entry for the joints {missing}. Its patterns {list(table)} must cover "
-            "every selected joint."
-        )
-    wrong = {
-        pattern: value for pattern, value in table.items() if not (value > above and value >= least)
-    }
-    if wrong:
-        bound = f"above {above:g}" if above > least else f"of at least {least:g}"
-        raise ValueError(f"{name}: expected numbers {bound}, got {wrong}.")
-    return [float(value) for value in values]
-
-
-# MERGED mjlab.tasks.velocity.mdp.rewards: Reward terms about feet: how long and how high they swing, how they land, whether they slip.
-#
-# Columns of different sources (contacts, heights, sites) are multiplied with each other, so that all
-# of them have to list the feet in one order. That is checked when the terms are built.
-
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
-
-
-def _check_air_time(
-    env: ManagerBasedRlEnv,
-    sensor_name: str,
-    threshold_min: float = 0.05,
-    threshold_max: float = 0.5,
-    command_name: str | None = None,
-    **_: Any,
-) -> None:
-    check_air_time_sensor(env, sensor_name)
-    require_command(env, command_name)
-    if threshold_min >= threshold_max:
-        raise ValueError(
-            f"threshold_min is {threshold_min} and threshold_max is {threshold_max}; no air time "
-            "is between them."
-        )
-
-
-@checked_when_built(_check_air_time)
-def feet_air_time(
-    env: ManagerBasedRlEnv,
-    sensor_name: str,
-    threshold_min: float = 0.05,
-    threshold_max: float = 0.5,
-    command_name: str | None = None,
-    command_threshold: float = 0.5,
-) -> torch.Tensor:
-    """Number of feet that have been in the air for between `threshold_min` and `threshold_max` (s).
-
-    Args:
-        env: The environment.
-        sensor_name: Contact sensor of the feet, with `track_air_time`.
-        threshold_min: Air times up to this do not count.
-        threshold_max: Air times from this on do not count.
-        command_name: Velocity command without which there is no reward; None: always.
-        command_threshold: Commanded motion above which there is a reward.
-    """
-    air_time = env.scene[sensor_name].data.current_air_time
-    log_metric(env, "air_time_mean", masked_mean(air_time, air_time > 0.0))
-    swinging = (air_time > threshold_min) & (air_time < threshold_max)
-    return if_commanded(swinging.sum(dim=1).float(), env, command_name, command_threshold)
-
-
-def _check_clearance(
-    env: ManagerBasedRlEnv,
-    height_sensor_name: str,
-    command_name: str | None = None,
-    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
-    **_: Any,
-) -> None:
-    require_command(env, command_name)
-    heights = f"The height sensor {height_sensor_name!r}", height_columns(env, height_sensor_name)
-    check_same_feet(env, heights, ("the selection of sites", site_columns(env, asset_cfg)))
-
-
-@accepts_older_params
-@checked_when_built(_check_clearance)
-def feet_clearance(
-    env: ManagerBasedRlEnv,
-    target_height: float,
-    height_sensor_name: str,
-    command_name: str | None = None,
-    command_threshold: float = 0.01,
-    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
-) -> torch.Tensor:
-    """Distance of moving feet from the height at which they should move (m^2/s):
-
-        sum over feet of |height - target_height| * |v_xy|
-
-    A foot that stands does not move, so that its height costs nothing.
-
-    Args:
-        env: The environment.
-        target_height: Height above the ground at which feet should swing, in metres.
-        height_sensor_name: Height sensor with one frame for each foot.
-        command_name: Velocity command without which there is no cost; None: always.
-        command_threshold: Commanded motion above which there is a cost.
-        asset_cfg: Entity, and the sites of the feet in the order of the sensor's frames.
-    """
-    miss = env.scene[height_sensor_name].data.heights - target_height
-    return clearance_cost(env, miss, command_name, command_threshold, asset_cfg)
-
-
-def clearance_cost(
-    env: ManagerBasedRlEnv,
-    miss: torch.Tensor,
-    command_name: str | None,
-    command_threshold: float,
-    asset_cfg: SceneEntityCfg,
-) -> torch.Tensor:
-    """Return the cost of feet that miss their height by `miss` (m), (N, feet), while they move."""
-    cost = (miss.abs() * _site_speed(env, asset_cfg)).sum(dim=1)
-    return if_commanded(cost, env, command_name, command_threshold)
-
-
-@accepts_older_params
-class feet_swing_height:
-    """Cost of landing after a swing that was too low or too high: `(peak / target - 1)^2`.
-
-    The peak is the greatest height (m) of the foot since it left the ground, and the cost is that
-    of the feet that land in this step, where motion is commanded.
-
-    Params:
-        sensor_name: Contact sensor of the feet, with `track_air_time`.
-        height_sensor_name: Height sensor with one frame for each foot, in the same order.
-        target_height: Height that a swing should reach, in metres.
-        command_name: The velocity command.
-        command_threshold: Commanded motion above which there is a cost.
-
-    Raises, when built: `ValueError` for sensors that do not exist, or list other feet.
-    """
-
-    def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
-        params = cfg.params
-        contact = params["sensor_name"]
-        require_command(env, params["command_name"])
-        check_air_time_sensor(env, contact)
-        check_feet_sensor(env, contact)
-        if not params["target_height"] > 0.0:
-            raise ValueError(
-                f"target_height is {params['target_height']!r}; heights are compared with it, so "
-                "it has to be positive."
-            )
-        feet = contact_columns(env, contact)
-        contacts = f"The contact sensor {contact!r}", feet
-        self._check_feet(env, contacts, self._height_columns(env, params))
-        self.peak_heights = torch.zeros(
-            env.num_envs, len(feet), dtype=torch.float32, device=env.device
-        )
-
-    def __call__(
-        self,
-        env: ManagerBasedRlEnv,
-        sensor_name: str,
-        height_sensor_name: str,
-        target_height: float,
-        command_name: str,
-        command_threshold: float,
-    ) -> torch.Tensor:
-        """Update the peak heights, and return the cost of landings in this step, (N,)."""
-        heights = env.scene[height_sensor_name].data.heights
-        cost = self.landing_cost(env, sensor_name, heights, target_height)
-        return if_commanded(cost, env, command_name, command_threshold)
-
-    def landing_cost(
-        self, env: ManagerBasedRlEnv, sensor_name: str, heights: torch.Tensor, target_height: float
-    ) -> torch.Tensor:
-        """Update the peaks with `heights` (m), (N, feet); return the cost of landings, (N,)."""
-        sensor = env.scene[sensor_name]
-        peaks = self.peak_heights
-        is_swinging = sensor.data.found == 0
-        higher = torch.maximum(peaks, heights)
-        torch.where(is_swinging, higher, peaks, out=peaks)
-        has_landed = sensor.compute_first_contact(dt=env.step_dt)
-        log_metric(env, "peak_height_mean", masked_mean(peaks, has_landed))
-        miss = (peaks / target_height - 1.0).square_()
-        cost = torch.where(has_landed, miss, 0.0).sum(dim=1)
-        peaks.masked_fill_(has_landed, 0.0)
-        return cost
-
-    def _check_feet(self, env: ManagerBasedRlEnv, contacts: Source, heights: Source) -> None:
-        check_same_feet(env, contacts, heights)
-
-    @staticmethod
-    def _height_columns(
-        env: ManagerBasedRlEnv, params: dict[str, Any]
-    ) -> tuple[str, list[tuple[str, int]]]:
-        name = params["height_sensor_name"]
-        return f"the height sensor {name!r}", height_columns(env, name)
-
-    def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
-        """Forget the swings that a reset cut off, so that the next episode does not pay for them."""
-        self.peak_heights[slice(None) if env_ids is None else env_ids] = 0.0
-
-
-def _check_slip(
-    env: ManagerBasedRlEnv,
-    sensor_name: str,
-    command_name: str,
-    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
-    **_: Any,
-) -> None:
-    require_command(env, command_name)
-    check_feet_sensor(env, sensor_name)
-    contacts = f"The contact sensor {sensor_name!r}", contact_columns(env, sensor_name)
-    check_same_feet(env, contacts, ("the selection of sites", site_columns(env, asset_cfg)))
-
-
-@checked_when_built(_check_slip)
-def feet_slip(
-    env: ManagerBasedRlEnv,
-    sensor_name: str,
-    command_name: str,
-    command_threshold: float = 0.01,
-    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
-) -> torch.Tensor:
-    """Squared horizontal speed of the feet that touch the ground, summed (m^2/s^2).
-
-    Args:
-        env: The environment.
-        sensor_name: Contact sensor of the feet.
-        command_name: Velocity command without which there is no cost.
-        command_threshold: Commanded motion above which there is a cost.
-        asset_cfg: Entity, and the sites of the feet in the order of the sensor's columns.
-    """
-    in_contact = env.scene[sensor_name].data.found > 0
-    speed = _site_speed(env, asset_cfg)
-    log_metric(env, "slip_velocity_mean", masked_mean(speed, in_contact))
-    cost = torch.where(in_contact, speed.square_(), 0.0).sum(dim=1)
-    return if_commanded(cost, env, command_name, command_threshold)
-
-
-def _check_landing(
-    env: ManagerBasedRlEnv, sensor_name: str, command_name: str | None = None, **_: Any
-) -> None:
-    require_command(env, command_name)
-    check_landing_sensor(env, sensor_name)
-
-
-@checked_when_built(_check_landing)
-def soft_landing(
-    env: ManagerBasedRlEnv,
-    sensor_name: str,
-    command_name: str | None = None,
-    command_threshold: float = 0.05,
-) -> torch.Tensor:
-    """Force of the ground on the feet that land in this step, summed (N).
-
-    It is the force of the last physics substep, not the peak of the impact.
-
-    Args:
-        env: The environment.
-        sensor_name: Contact sensor of the feet, with `track_air_time`.
-        command_name: Velocity command without which there is no cost; None: always.
-        command_threshold: Commanded motion above which there is a cost.
-    """
-    sensor = env.scene[sensor_name]
-    force = torch.linalg.vector_norm(sensor.data.force, dim=-1)
-    has_landed = sensor.compute_first_contact(dt=env.step_dt)
-    log_metric(env, "landing_force_mean", masked_mean(force, has_landed))
-    cost = torch.where(has_landed, force, 0.0).sum(dim=1)
-    return if_commanded(cost, env, command_name, command_threshold)
-
-
-def _site_speed(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
-    """Return the horizontal speed of the selected sites, (N, sites), in m/s."""
-    asset: Entity = env.scene[asset_cfg.name]
-    sites = as_columns(asset_cfg.site_ids, env.device)
-    velocity = asset.data.site_lin_vel_w[:, sites]
-    # By components: a norm over a last dimension of two takes a CPU longer.
-    return velocity[..., 0].square().addcmul_(velocity[..., 1], velocity[..., 1]).sqrt_()
-
-
-__getattr__ = older_names(__name__)
 
 
 def _check_tracking(env: ManagerBasedRlEnv, std: float, command_name: str, **_: Any) -> None:
@@ -632,3 +270,363 @@ class variable_posture:
         speed = command_speed(env, command_name)
         gait = (speed >= walking_threshold).long() + (speed >= running_threshold).long()
         return torch.exp(-(error.square_() * self._weights[gait]).sum(dim=1))
+
+
+# Feet: how long and how high they swing, how they land, whether they slip.
+
+
+def _check_air_time(
+    env: ManagerBasedRlEnv,
+    sensor_name: str,
+    threshold_min: float = 0.05,
+    threshold_max: float = 0.5,
+    command_name: str | None = None,
+    **_: Any,
+) -> None:
+    check_air_time_sensor(env, sensor_name)
+    require_command(env, command_name)
+    if threshold_min >= threshold_max:
+        raise ValueError(
+            f"threshold_min is {threshold_min} and threshold_max is {threshold_max}; no air time "
+            "is between them."
+        )
+
+
+@checked_when_built(_check_air_time)
+def feet_air_time(
+    env: ManagerBasedRlEnv,
+    sensor_name: str,
+    threshold_min: float = 0.05,
+    threshold_max: float = 0.5,
+    command_name: str | None = None,
+    command_threshold: float = 0.5,
+) -> torch.Tensor:
+    """Number of feet that have been in the air for between `threshold_min` and `threshold_max` (s).
+
+    Args:
+        env: The environment.
+        sensor_name: Contact sensor of the feet, with `track_air_time`.
+        threshold_min: Air times up to this do not count.
+        threshold_max: Air times from this on do not count.
+        command_name: Velocity command without which there is no reward; None: always.
+        command_threshold: Commanded motion above which there is a reward.
+    """
+    air_time = env.scene[sensor_name].data.current_air_time
+    log_metric(env, "air_time_mean", masked_mean(air_time, air_time > 0.0))
+    swinging = (air_time > threshold_min) & (air_time < threshold_max)
+    return if_commanded(swinging.sum(dim=1).float(), env, command_name, command_threshold)
+
+
+def _check_clearance(
+    env: ManagerBasedRlEnv,
+    height_sensor_name: str,
+    command_name: str | None = None,
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+    **_: Any,
+) -> None:
+    require_command(env, command_name)
+    heights = f"The height sensor {height_sensor_name!r}", height_columns(env, height_sensor_name)
+    check_same_feet(env, heights, ("the selection of sites", site_columns(env, asset_cfg)))
+
+
+@accepts_older_params
+@checked_when_built(_check_clearance)
+def feet_clearance(
+    env: ManagerBasedRlEnv,
+    target_height: float,
+    height_sensor_name: str,
+    command_name: str | None = None,
+    command_threshold: float = 0.01,
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+) -> torch.Tensor:
+    """Distance of moving feet from the height at which they should move (m^2/s):
+
+        sum over feet of |height - target_height| * |v_xy|
+
+    A foot that stands does not move, so that its height costs nothing.
+
+    Args:
+        env: The environment.
+        target_height: Height above the ground at which feet should swing, in metres.
+        height_sensor_name: Height sensor with one frame for each foot.
+        command_name: Velocity command without which there is no cost; None: always.
+        command_threshold: Commanded motion above which there is a cost.
+        asset_cfg: Entity, and the sites of the feet in the order of the sensor's frames.
+    """
+    miss = env.scene[height_sensor_name].data.heights - target_height
+    return clearance_cost(env, miss, command_name, command_threshold, asset_cfg)
+
+
+def clearance_cost(
+    env: ManagerBasedRlEnv,
+    miss: torch.Tensor,
+    command_name: str | None,
+    command_threshold: float,
+    asset_cfg: SceneEntityCfg,
+) -> torch.Tensor:
+    """Return the cost of feet that miss their height by `miss` (m), (N, feet), while they move."""
+    cost = (miss.abs() * _site_speed(env, asset_cfg)).sum(dim=1)
+    return if_commanded(cost, env, command_name, command_threshold)
+
+
+@accepts_older_params
+class feet_swing_height:
+    """Cost of landing after a swing that was too low or too high: `(peak / target - 1)^2`.
+
+    The peak is the greatest height (m) of the foot since it left the ground, and the cost is that
+    of the feet that land in this step, where motion is commanded.
+
+    Params:
+        sensor_name: Contact sensor of the feet, with `track_air_time`.
+        height_sensor_name: Height sensor with one frame for each foot, in the same order.
+        target_height: Height that a swing should reach, in metres.
+        command_name: The velocity command.
+        command_threshold: Commanded motion above which there is a cost.
+
+    Raises, when built: `ValueError` for sensors that do not exist, or list other feet.
+    """
+
+    def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
+        params = cfg.params
+        contact = params["sensor_name"]
+        require_command(env, params["command_name"])
+        check_air_time_sensor(env, contact)
+        check_feet_sensor(env, contact)
+        check_positive("target_height", params["target_height"])
+        feet = contact_columns(env, contact)
+        contacts = f"The contact sensor {contact!r}", feet
+        self._check_feet(env, contacts, self._height_columns(env, params))
+        self.peak_heights = torch.zeros(
+            env.num_envs, len(feet), dtype=torch.float32, device=env.device
+        )
+
+    def __call__(
+        self,
+        env: ManagerBasedRlEnv,
+        sensor_name: str,
+        height_sensor_name: str,
+        target_height: float,
+        command_name: str,
+        command_threshold: float,
+    ) -> torch.Tensor:
+        """Update the peak heights, and return the cost of landings in this step, (N,)."""
+        heights = env.scene[height_sensor_name].data.heights
+        cost = self.landing_cost(env, sensor_name, heights, target_height)
+        return if_commanded(cost, env, command_name, command_threshold)
+
+    def landing_cost(
+        self, env: ManagerBasedRlEnv, sensor_name: str, heights: torch.Tensor, target_height: float
+    ) -> torch.Tensor:
+        """Update the peaks with `heights` (m), (N, feet); return the cost of landings, (N,)."""
+        sensor = env.scene[sensor_name]
+        peaks = self.peak_heights
+        is_swinging = sensor.data.found == 0
+        higher = torch.maximum(peaks, heights)
+        torch.where(is_swinging, higher, peaks, out=peaks)
+        has_landed = sensor.compute_first_contact(dt=env.step_dt)
+        log_metric(env, "peak_height_mean", masked_mean(peaks, has_landed))
+        miss = (peaks / target_height - 1.0).square_()
+        cost = torch.where(has_landed, miss, 0.0).sum(dim=1)
+        peaks.masked_fill_(has_landed, 0.0)
+        return cost
+
+    def _check_feet(self, env: ManagerBasedRlEnv, contacts: Source, heights: Source) -> None:
+        check_same_feet(env, contacts, heights)
+
+    @staticmethod
+    def _height_columns(
+        env: ManagerBasedRlEnv, params: dict[str, Any]
+    ) -> tuple[str, list[tuple[str, int]]]:
+        name = params["height_sensor_name"]
+        return f"the height sensor {name!r}", height_columns(env, name)
+
+    def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
+        """Forget the swings that a reset cut off, so that the next episode does not pay for them."""
+        self.peak_heights[slice(None) if env_ids is None else env_ids] = 0.0
+
+
+def _check_slip(
+    env: ManagerBasedRlEnv,
+    sensor_name: str,
+    command_name: str,
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+    **_: Any,
+) -> None:
+    require_command(env, command_name)
+    check_feet_sensor(env, sensor_name)
+    contacts = f"The contact sensor {sensor_name!r}", contact_columns(env, sensor_name)
+    check_same_feet(env, contacts, ("the selection of sites", site_columns(env, asset_cfg)))
+
+
+@checked_when_built(_check_slip)
+def feet_slip(
+    env: ManagerBasedRlEnv,
+    sensor_name: str,
+    command_name: str,
+    command_threshold: float = 0.01,
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+) -> torch.Tensor:
+    """Squared horizontal speed of the feet that touch the ground, summed (m^2/s^2).
+
+    Args:
+        env: The environment.
+        sensor_name: Contact sensor of the feet.
+        command_name: Velocity command without which there is no cost.
+        command_threshold: Commanded motion above which there is a cost.
+        asset_cfg: Entity, and the sites of the feet in the order of the sensor's columns.
+    """
+    in_contact = env.scene[sensor_name].data.found > 0
+    speed = _site_speed(env, asset_cfg)
+    log_metric(env, "slip_velocity_mean", masked_mean(speed, in_contact))
+    cost = torch.where(in_contact, speed.square_(), 0.0).sum(dim=1)
+    return if_commanded(cost, env, command_name, command_threshold)
+
+
+def _check_landing(
+    env: ManagerBasedRlEnv, sensor_name: str, command_name: str | None = None, **_: Any
+) -> None:
+    require_command(env, command_name)
+    check_air_time_sensor(env, sensor_name)
+    check_feet_sensor(env, sensor_name)
+    check_force_sensor(env, sensor_name)
+
+
+@checked_when_built(_check_landing)
+def soft_landing(
+    env: ManagerBasedRlEnv,
+    sensor_name: str,
+    command_name: str | None = None,
+    command_threshold: float = 0.05,
+) -> torch.Tensor:
+    """Force of the ground on the feet that land in this step, summed (N).
+
+    It is the force of the last physics substep, not the peak of the impact.
+
+    Args:
+        env: The environment.
+        sensor_name: Contact sensor of the feet, with `track_air_time`.
+        command_name: Velocity command without which there is no cost; None: always.
+        command_threshold: Commanded motion above which there is a cost.
+    """
+    sensor = env.scene[sensor_name]
+    force = torch.linalg.vector_norm(sensor.data.force, dim=-1)
+    has_landed = sensor.compute_first_contact(dt=env.step_dt)
+    log_metric(env, "landing_force_mean", masked_mean(force, has_landed))
+    cost = torch.where(has_landed, force, 0.0).sum(dim=1)
+    return if_commanded(cost, env, command_name, command_threshold)
+
+
+# Quantities that several terms compute.
+
+
+def velocity_command(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
+    """Return a velocity command (vx, vy, wz) in the frame of the root, (N, 3)."""
+    # That it exists was checked when the term was built.
+    manager: Any = env.command_manager
+    return manager.get_command(command_name)
+
+
+def command_speed(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
+    """Return `|c_xy| + |c_z|` of a velocity command, (N,): how much motion is asked for."""
+    command = velocity_command(env, command_name)
+    return torch.linalg.vector_norm(command[:, :2], dim=1).add_(command[:, 2].abs())
+
+
+def if_commanded(
+    cost: torch.Tensor, env: ManagerBasedRlEnv, command_name: str | None, threshold: float
+) -> torch.Tensor:
+    """Return `cost` (N,), and 0 where the command asks for no more motion than `threshold`.
+
+    Without a command's name, `cost` is returned as it is.
+    """
+    if command_name is None:
+        return cost
+    return torch.where(command_speed(env, command_name) > threshold, cost, 0.0)
+
+
+def log_metric(env: ManagerBasedRlEnv, name: str, value: torch.Tensor) -> None:
+    """Log one number of this step under `Metrics/<name>`."""
+    env.extras.setdefault("log", {})[f"Metrics/{name}"] = value
+
+
+def masked_mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    """Return the mean of the finite values where `mask` is true, as one number; 0 if there are none."""
+    # `isfinite` takes twice the operations.
+    mask = mask & (values.abs() < torch.inf)
+    return torch.where(mask, values, 0.0).sum() / mask.sum().clamp(min=1)
+
+
+def tilt_of(quat: torch.Tensor) -> torch.Tensor:
+    """Return the squared horizontal part of "up" in frames of orientation (N, 4): sin(tilt)^2, (N,).
+
+    With x and y of a unit quaternion, that of the third row of its rotation matrix is
+    `4 s (1 - s)`, where s = x^2 + y^2.
+    """
+    x, y = quat[:, 1], quat[:, 2]
+    share = x * x + y * y
+    return 4.0 * share * (1.0 - share)
+
+
+def single_body(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> int | None:
+    """Return the index of the selected body, or None for the root where none is selected.
+
+    Raises:
+        ValueError: several bodies are selected; the message names them.
+    """
+    ids: Any = asset_cfg.body_ids
+    entity: Entity = env.scene[asset_cfg.name]
+    if isinstance(ids, slice) and asset_cfg.body_names is None:
+        return None
+    chosen = list(range(entity.num_bodies))[ids] if isinstance(ids, slice) else list(ids)
+    if len(chosen) != 1:
+        names = [entity.body_names[i] for i in chosen]
+        raise ValueError(
+            f"asset_cfg selects the bodies {names} of entity {asset_cfg.name!r}; exactly one is "
+            f"needed, or no body_names for the root {entity.body_names[0]!r}."
+        )
+    return int(chosen[0])
+
+
+def values_of_joints(
+    joints: list[str],
+    name: str,
+    table: dict[str, float],
+    *,
+    above: float = -math.inf,
+    least: float = -math.inf,
+) -> list[float]:
+    """Return the value of each joint, of the parameter `name`, a table of patterns and values.
+
+    Raises:
+        ValueError: a joint matches no pattern or several, a pattern matches no joint, or a value is
+            not `above` a bound or less than the `least`.
+    """
+    try:
+        _, covered, values = resolve_matching_names_values(table, joints)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+    missing = [joint for joint in joints if joint not in covered]
+    if missing:
+        raise ValueError(
+            f"{name} has no entry for the joints {missing}. Its patterns {list(table)} must cover "
+            "every selected joint."
+        )
+    wrong = {
+        pattern: value for pattern, value in table.items() if not (value > above and value >= least)
+    }
+    if wrong:
+        bound = f"above {above:g}" if above > least else f"of at least {least:g}"
+        raise ValueError(f"{name}: expected numbers {bound}, got {wrong}.")
+    return [float(value) for value in values]
+
+
+def _site_speed(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
+    """Return the horizontal speed of the selected sites, (N, sites), in m/s."""
+    asset: Entity = env.scene[asset_cfg.name]
+    sites = as_columns(asset_cfg.site_ids, env.device)
+    velocity = asset.data.site_lin_vel_w[:, sites]
+    # By components: a norm over a last dimension of two takes a CPU longer.
+    return velocity[..., 0].square().addcmul_(velocity[..., 1], velocity[..., 1]).sqrt_()
+
+
+__getattr__ = older_names(__name__)

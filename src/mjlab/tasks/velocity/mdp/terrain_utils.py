@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.sensor import RayCastSensor
+from mjlab.utils.errors import WrongTypeError
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -18,6 +19,42 @@ _EPS = float(torch.finfo(torch.float32).eps)
 _MAX_THICKNESS = 0.1
 # Points that lie on a line have no plane.
 _MIN_WIDTH = 1e-6
+
+
+def terrain_normal_from_sensors(
+    env: ManagerBasedRlEnv, sensor_names: tuple[str, ...], max_points: int = 32
+) -> torch.Tensor:
+    """Return the upward normal of the ground that ray sensors see, (N, 3).
+
+    Args:
+        env: The environment.
+        sensor_names: Ray sensors, whose hits are fitted together.
+        max_points: Most rays to take of each sensor; they are spread evenly over its rays.
+
+    Raises:
+        TypeError: a sensor is no ray sensor.
+    """
+    points, valid = [], []
+    for name in sensor_names:
+        sensor = env.scene[name]
+        if not isinstance(sensor, RayCastSensor):
+            raise WrongTypeError(
+                f"Sensor {name!r}: expected RayCastSensor, got {type(sensor).__name__}."
+            )
+        data = sensor.data
+        rays = _spread(data.distances.shape[1], max_points, str(data.distances.device))
+        points.append(data.hit_pos_w[:, rays])
+        valid.append(data.distances[:, rays] >= 0.0)
+    if len(points) == 1:
+        return fit_terrain_normal(points[0], valid[0])
+    return fit_terrain_normal(torch.cat(points, dim=1), torch.cat(valid, dim=1))
+
+
+@functools.lru_cache(maxsize=64)
+def _spread(count: int, max_points: int, device: str) -> torch.Tensor | slice:
+    if count <= max_points:
+        return slice(None)
+    return torch.linspace(0, count - 1, max_points, dtype=torch.float32).long().to(device)
 
 
 def fit_terrain_normal(points: torch.Tensor, valid_mask: torch.Tensor) -> torch.Tensor:
@@ -54,42 +91,6 @@ def fit_terrain_normal(points: torch.Tensor, valid_mask: torch.Tensor) -> torch.
     return torch.where(is_plane.unsqueeze(-1), normal, eye[2]).to(points.dtype)
 
 
-def terrain_normal_from_sensors(
-    env: ManagerBasedRlEnv, sensor_names: tuple[str, ...], max_points: int = 32
-) -> torch.Tensor:
-    """Return the upward normal of the ground that ray sensors see, (N, 3).
-
-    Args:
-        env: The environment.
-        sensor_names: Ray sensors, whose hits are fitted together.
-        max_points: Most rays to take of each sensor; they are spread evenly over its rays.
-
-    Raises:
-        TypeError: a sensor is no ray sensor.
-    """
-    points, valid = [], []
-    for name in sensor_names:
-        sensor = env.scene[name]
-        if not isinstance(sensor, RayCastSensor):
-            raise TypeError(
-                f"{name!r} is a {type(sensor).__name__}; the ground's normal needs a RayCastSensor."
-            )
-        data = sensor.data
-        rays = _spread(data.distances.shape[1], max_points, str(data.distances.device))
-        points.append(data.hit_pos_w[:, rays])
-        valid.append(data.distances[:, rays] >= 0.0)
-    if len(points) == 1:
-        return fit_terrain_normal(points[0], valid[0])
-    return fit_terrain_normal(torch.cat(points, dim=1), torch.cat(valid, dim=1))
-
-
-@functools.lru_cache(maxsize=64)
-def _spread(count: int, max_points: int, device: str) -> torch.Tensor | slice:
-    if count <= max_points:
-        return slice(None)
-    return torch.linspace(0, count - 1, max_points, dtype=torch.float32).long().to(device)
-
-
 def _eigenvalues(matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return the eigenvalues of symmetric (N, 3, 3) matrices, each (N,), ascending.
 
@@ -102,17 +103,13 @@ def _eigenvalues(matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torc
     shifted = matrix - mean[:, None, None] * eye
     radius = (shifted.square().sum(dim=(-2, -1)) / 6.0).sqrt()
     safe = radius.clamp(min=torch.finfo(matrix.dtype).tiny ** 0.25)
-    half_det = _determinant(shifted / safe[:, None, None]) / 2.0
+    a, b, c = (shifted / safe[:, None, None]).unbind(dim=-2)
+    half_det = (a * torch.linalg.cross(b, c)).sum(dim=-1) / 2.0
     # Rounding may leave the domain of the arc cosine.
     angle = torch.acos(half_det.clamp(-1.0, 1.0)) / 3.0
     largest = mean + 2.0 * radius * torch.cos(angle)
     least = mean + 2.0 * radius * torch.cos(angle + 2.0 * math.pi / 3.0)
     return least, 3.0 * mean - largest - least, largest
-
-
-def _determinant(matrix: torch.Tensor) -> torch.Tensor:
-    a, b, c = matrix.unbind(dim=-2)
-    return (a * torch.linalg.cross(b, c)).sum(dim=-1)
 
 
 def _null_vector(matrix: torch.Tensor) -> torch.Tensor:

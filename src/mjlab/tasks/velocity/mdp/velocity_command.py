@@ -13,6 +13,7 @@ from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.term_checks import check_range
 from mjlab.tasks.velocity.mdp.velocity_joystick import VelocityJoystick
+from mjlab.utils.errors import check_in_range
 from mjlab.utils.indexing import as_ids, is_empty
 from mjlab.utils.lab_api.math import matrix_from_quat, quat_apply, wrap_to_pi
 
@@ -20,12 +21,8 @@ if TYPE_CHECKING:
     import viser
 
     from mjlab.entity import Entity
-    from mjlab.entity.data import EntityData
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.viewer.debug_visualizer import Color, DebugVisualizer
-
-
-# MERGED mjlab.tasks.velocity.mdp.velocity_command: What a velocity command refuses when it is built.
 
 RANGES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 """The ranges that every velocity command has."""
@@ -36,78 +33,13 @@ _PROBABILITIES = (
     "rel_forward_envs",
     "init_velocity_prob",
 )
-
-
-def check_command_cfg(cfg: UniformVelocityCommandCfg) -> None:
-    """Raise `ValueError` for ranges, shares or a heading that make no sense."""
-    for name in RANGES:
-        check_range(f"ranges.{name}", getattr(cfg.ranges, name))
-    if cfg.heading_command and cfg.ranges.heading is None:
-        raise ValueError("heading_command is True, but ranges.heading is None. Give the range.")
-    if not cfg.heading_command and cfg.ranges.heading is not None:
-        raise ValueError(
-            f"ranges.heading is {cfg.ranges.heading}, but heading_command is False, so that no "
-            "heading is ever commanded. Set heading_command=True, or ranges.heading=None."
-        )
-    if cfg.ranges.heading is not None:
-        check_range("ranges.heading", cfg.ranges.heading)
-    for name in _PROBABILITIES:
-        if not 0.0 <= getattr(cfg, name) <= 1.0:
-            raise ValueError(f"{name} is {getattr(cfg, name)!r}; a share is between 0 and 1.")
-
-
-# MERGED mjlab.tasks.velocity.mdp.velocity_command: Arrows that show commanded and actual velocity.
-
-_COMMANDED_LINEAR: Color = (0.2, 0.2, 0.6, 0.6)
-_COMMANDED_YAW: Color = (0.2, 0.6, 0.2, 0.6)
-_ACTUAL_LINEAR: Color = (0.0, 0.6, 1.0, 0.7)
-_ACTUAL_YAW: Color = (0.0, 1.0, 0.4, 0.7)
-
-
-def draw_velocity_arrows(
-    visualizer: DebugVisualizer,
-    data: EntityData,
-    command: torch.Tensor,
-    z_offset: float,
-    scale: float,
-) -> None:
-    """Draw four arrows above the root: commanded (blue) and actual (cyan) horizontal velocity, and
-    commanded (green) and actual (light green) yaw rate along the root's z axis.
-
-    Args:
-        visualizer: What to draw into.
-        data: State of the robot.
-        command: (N, 3) commanded vx, vy, wz in the frame of the root.
-        z_offset: Height of the arrows' foot above the root, times `scale`, in metres.
-        scale: Length of an arrow for 1 m/s or 1 rad/s, in metres.
-    """
-    indices = list(visualizer.get_env_indices(len(command)))
-    if not indices:
-        return
-    rotations = matrix_from_quat(data.root_link_quat_w[indices])
-    linear = data.root_link_lin_vel_b[indices]
-    angular = data.root_link_ang_vel_b[indices]
-    asked = command[indices]
-    zero = torch.zeros_like(asked[:, 0])
-    vectors = torch.stack(
-        (
-            torch.stack((zero, zero, zero + z_offset), dim=1),
-            torch.stack((asked[:, 0], asked[:, 1], zero), dim=1),
-            torch.stack((zero, zero, asked[:, 2]), dim=1),
-            torch.stack((linear[:, 0], linear[:, 1], zero), dim=1),
-            torch.stack((zero, zero, angular[:, 2]), dim=1),
-        ),
-        dim=2,
-    )
-    # Columns of (3, 5) matrices are the five vectors, in world axes.
-    drawn = (scale * rotations @ vectors).transpose(1, 2).cpu().numpy()
-    roots = data.root_link_pos_w[indices].cpu().numpy()
-    colors = (_COMMANDED_LINEAR, _COMMANDED_YAW, _ACTUAL_LINEAR, _ACTUAL_YAW)
-    for root, (offset, *arrows) in zip(roots, drawn, strict=True):
-        for arrow, color in zip(arrows, colors, strict=True):
-            visualizer.add_arrow(root + offset, root + offset + arrow, color)
-
-
+# Of arrows: commanded linear and yaw, actual linear and yaw velocity.
+_ARROW_COLORS: tuple[Color, ...] = (
+    (0.2, 0.2, 0.6, 0.6),
+    (0.2, 0.6, 0.2, 0.6),
+    (0.0, 0.6, 1.0, 0.7),
+    (0.0, 1.0, 0.4, 0.7),
+)
 _MIN_FORWARD_SPEED = 0.3
 """Least speed that environments which only go forward are asked for, in m/s."""
 
@@ -170,6 +102,23 @@ class UniformVelocityCommandCfg(CommandTermCfg):
     def build(self, env: ManagerBasedRlEnv) -> UniformVelocityCommand:
         """Return the term; raises `ValueError` for ranges or shares that make no sense."""
         return UniformVelocityCommand(self, env)
+
+
+def check_command_cfg(cfg: UniformVelocityCommandCfg) -> None:
+    """Raise `ValueError` for ranges, shares or a heading that make no sense."""
+    for name in RANGES:
+        check_range(f"ranges.{name}", getattr(cfg.ranges, name))
+    if cfg.heading_command and cfg.ranges.heading is None:
+        raise ValueError("heading_command is True, but ranges.heading is None. Give the range.")
+    if not cfg.heading_command and cfg.ranges.heading is not None:
+        raise ValueError(
+            f"ranges.heading is {cfg.ranges.heading}, but heading_command is False, so that no "
+            "heading is ever commanded. Set heading_command=True, or ranges.heading=None."
+        )
+    if cfg.ranges.heading is not None:
+        check_range("ranges.heading", cfg.ranges.heading)
+    for name in _PROBABILITIES:
+        check_in_range(name, getattr(cfg, name), 0.0, 1.0)
 
 
 class UniformVelocityCommand(CommandTerm):
@@ -389,13 +338,34 @@ class UniformVelocityCommand(CommandTerm):
             self.metrics[name][index] = mean + (error - mean) * share
 
     def _debug_vis_impl(self, visualizer: DebugVisualizer) -> None:
-        draw_velocity_arrows(
-            visualizer,
-            self.robot.data,
-            self.vel_command_b,
-            self.cfg.viz.z_offset,
-            self.cfg.viz.scale,
+        """Draw four arrows above the root: commanded (blue) and actual (cyan) horizontal velocity, and
+        commanded (green) and actual (light green) yaw rate along the root's z axis.
+        """
+        indices = list(visualizer.get_env_indices(self.num_envs))
+        if not indices:
+            return
+        data, viz = self.robot.data, self.cfg.viz
+        rotations = matrix_from_quat(data.root_link_quat_w[indices])
+        linear = data.root_link_lin_vel_b[indices]
+        angular = data.root_link_ang_vel_b[indices]
+        asked = self.vel_command_b[indices]
+        zero = torch.zeros_like(asked[:, 0])
+        vectors = torch.stack(
+            (
+                torch.stack((zero, zero, zero + viz.z_offset), dim=1),
+                torch.stack((asked[:, 0], asked[:, 1], zero), dim=1),
+                torch.stack((zero, zero, asked[:, 2]), dim=1),
+                torch.stack((linear[:, 0], linear[:, 1], zero), dim=1),
+                torch.stack((zero, zero, angular[:, 2]), dim=1),
+            ),
+            dim=2,
         )
+        # Columns of (3, 5) matrices are the five vectors, in world axes.
+        drawn = (viz.scale * rotations @ vectors).transpose(1, 2).cpu().numpy()
+        roots = data.root_link_pos_w[indices].cpu().numpy()
+        for root, (offset, *arrows) in zip(roots, drawn, strict=True):
+            for arrow, color in zip(arrows, _ARROW_COLORS, strict=True):
+                visualizer.add_arrow(root + offset, root + offset + arrow, color)
 
 
 def _scaled(unit: torch.Tensor, bounds: tuple[float, float]) -> torch.Tensor:

@@ -54,7 +54,11 @@ class VelocityJoystick:
                 self._sliders.append(self._add_slider(server, component, ranges))
             zero = server.gui.add_button("Zero")
         self._enabled.on_update(self._changed)
-        zero.on_click(self._zero)
+
+        @zero.on_click
+        def _(_event: Any) -> None:
+            for slider in self._sliders:
+                slider.value = 0.0
 
     def _add_slider(self, server: viser.ViserServer, component: str, ranges: Any) -> Any:
         low, high = _MAX_BOUNDS
@@ -86,10 +90,6 @@ class VelocityJoystick:
             self._replaced = index, command[index].clone()
             values = [float(slider.value) for slider in self._sliders]
             command[index] = torch.tensor(values, dtype=command.dtype, device=command.device)
-
-    def _zero(self, _event: Any) -> None:
-        for slider in self._sliders:
-            slider.value = 0.0
 
     def _moved(self, event: Any) -> None:
         # Whoever moves a slider wants to drive; `Zero` and `Max` move them without a person.

@@ -1,7 +1,30 @@
-"""TODO."""
+"""PPO settings of the velocity tasks, their profiles, and the errors that evaluations measure.
+
+The `cpu` profile is the Go1's, and for other robots; the G1 has its own. A few cores step some ten
+thousand environments a second, a hundredth of a GPU. Under the task's own settings a robot has not left its
+first idea by then, which is to stand still: trying to move costs more penalty than it earns. So the profile
+makes the task easier to learn, not easier to pass:
+
+- Penalties start at a fraction of their weight and grow to it, those that lift the feet sooner than
+  the others, and so do pushes; a reward for feet in the air, which the task has but does not weigh,
+  fades out meanwhile.
+- Contacts have no rolling and torsional friction, and a pyramidal friction cone. The solver then
+  takes half the time.
+- The mirror image of each sample is one more sample. Without it, a policy walks as soon, and stumbles
+  far longer in the directions that it has seen least.
+- Batches and networks are small, a policy may change more in an iteration, and rewards far away count
+  less: what a leg does shows within a second.
+
+Evaluations, `play` and `evaluate` undo the first two: what they show is the task as it is.
+
+The `blind` profile is for rough terrain: a student that does not see the ground. A teacher with the height
+scan learns first, under the profile `cpu`. The student then learns to act as the teacher does, from the
+other observations of the last steps.
+"""
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -10,43 +33,31 @@ import torch
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import (
     EvaluationCfg,
+    RslRlBaseRunnerCfg,
     RslRlModelCfg,
     RslRlOnPolicyRunnerCfg,
     RslRlPpoAlgorithmCfg,
     gaussian_distribution,
 )
+from mjlab.rl.learners import with_learner
 from mjlab.tasks.cpu_profile import cpu_profile
 from mjlab.tasks.easing import ease_weight
 
-# MERGED mjlab.tasks.velocity.rl.ppo: What evaluations of the velocity task measure: how far the robot is from its command.
-
+_STUDENT = "student"
+_SCAN = "height_scan"
+# How a foot met the ground shows for about two tenths of a second.
+_BLIND_HISTORY = 10
+_BLIND_STEPS = 24
 _ROBOT = "robot"
 _COMMAND = "twist"
-
-
-def lin_vel_error(env: Any) -> torch.Tensor:
-    """Return |c_xy - v_xy|, (num_envs,), in m/s: linear velocity of the root link, in its frame."""
-    return (_command(env)[:, :2] - _robot(env).root_link_lin_vel_b[:, :2]).norm(dim=-1)
-
-
-def ang_vel_error(env: Any) -> torch.Tensor:
-    """Return |c_z - w_z|, (num_envs,), in rad/s: turning rate of the root link, in its frame."""
-    return (_command(env)[:, 2] - _robot(env).root_link_ang_vel_b[:, 2]).abs()
-
-
-def _command(env: Any) -> torch.Tensor:
-    return env.command_manager.get_command(_COMMAND)
-
-
-def _robot(env: Any) -> Any:
-    return env.scene[_ROBOT].data
-
-
-TRACKING_ERRORS = {"lin_vel_error": lin_vel_error, "ang_vel_error": ang_vel_error}
-"""The errors by the name under which evaluations report them."""
-
-
-# MERGED mjlab.tasks.velocity.rl.ppo: What all robots share of how they learn the velocity task.
+_AIR_TIME = "air_time"
+_NUM_ENVS = 512
+_PENALTY_AT_FIRST = 0.02
+_AIR_TIME_AT_FIRST = 0.5
+_EASED_SAMPLES = 6_000_000
+# Whoever drags the feet falls at each change of command.
+_LIFTING = ("foot_clearance", "foot_swing_height")
+_LIFTING_EASED_SAMPLES = 2_000_000
 
 
 def velocity_ppo_runner_cfg(experiment_name: str, max_iterations: int) -> RslRlOnPolicyRunnerCfg:
@@ -65,33 +76,23 @@ def velocity_ppo_runner_cfg(experiment_name: str, max_iterations: int) -> RslRlO
     )
 
 
-# MERGED mjlab.tasks.velocity.rl.ppo: The `cpu` profile of velocity tasks: the Go1's, and for robots of one's own. The G1 has another.
-#
-# A few cores step some ten thousand environments a second, a hundredth of a GPU. Under the task's own
-# settings a robot has not left its first idea by then, which is to stand still: trying to move costs
-# more penalty than it earns. So the profile makes the task easier to learn, not easier to pass:
-#
-# - Penalties start at a fraction of their weight and grow to it, those that lift the feet sooner than
-#   the others, and so do pushes; a reward for feet in the air, which the task has but does not weigh,
-#   fades out meanwhile.
-# - Contacts have no rolling and torsional friction, and a pyramidal friction cone. The solver then
-#   takes half the time.
-# - The mirror image of each sample is one more sample. Without it, a policy walks as soon, and stumbles
-#   far longer in the directions that it has seen least.
-# - Batches and networks are small, a policy may change more in an iteration, and rewards far away count
-#   less: what a leg does shows within a second.
-#
-# Evaluations, `play` and `evaluate` undo the first two: what they show is the task as it is.
+def lin_vel_error(env: Any) -> torch.Tensor:
+    """Return |c_xy - v_xy|, (num_envs,), in m/s: linear velocity of the root link, in its frame."""
+    command = env.command_manager.get_command(_COMMAND)
+    return (command[:, :2] - env.scene[_ROBOT].data.root_link_lin_vel_b[:, :2]).norm(dim=-1)
 
-_AIR_TIME = "air_time"
-_NUM_ENVS = 512
-_PENALTY_AT_FIRST = 0.02
-_AIR_TIME_AT_FIRST = 0.5
-_EASED_SAMPLES = 6_000_000
 
-# Whoever drags the feet falls at each change of command.
-_LIFTING = ("foot_clearance", "foot_swing_height")
-_LIFTING_EASED_SAMPLES = 2_000_000
+def ang_vel_error(env: Any) -> torch.Tensor:
+    """Return |c_z - w_z|, (num_envs,), in rad/s: turning rate of the root link, in its frame."""
+    command = env.command_manager.get_command(_COMMAND)
+    return (command[:, 2] - env.scene[_ROBOT].data.root_link_ang_vel_b[:, 2]).abs()
+
+
+TRACKING_ERRORS = {"lin_vel_error": lin_vel_error, "ang_vel_error": ang_vel_error}
+"""The errors by the name under which evaluations report them."""
+
+
+# Profiles.
 
 
 def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
@@ -121,3 +122,17 @@ cpu = cpu_profile(
     mirror="mjlab.tasks.velocity.symmetry:mirror_left_right",
 )
 """Profile of the velocity tasks."""
+
+
+def blind(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> RslRlBaseRunnerCfg:
+    """Edit the task's config in place as `cpu` does, and return the config of a distillation."""
+    cpu(env_cfg, rl_cfg)
+    student = copy.deepcopy(env_cfg.observations["actor"])
+    assert student is not None
+    del student.terms[_SCAN]
+    student.history_length = _BLIND_HISTORY
+    env_cfg.observations[_STUDENT] = student
+    rl_cfg.num_steps_per_env = _BLIND_STEPS
+    cfg = with_learner(rl_cfg, "distillation")
+    cfg.obs_groups["student"] = (_STUDENT,)
+    return cfg

@@ -17,16 +17,6 @@ from mjlab.rl.config import (
 from mjlab.tasks.cpu_profile import cpu_profile
 from mjlab.tasks.easing import Undo
 
-# MERGED mjlab.tasks.manipulation.config.yam.rl_cfg: The `cpu` profile: settings of the manipulation tasks for a few cores.
-#
-# A few cores step some ten thousand environments a second, a hundredth of a GPU. So a batch is small,
-# and the networks are small enough for their update not to take longer than the physics.
-#
-# That is all that the tasks from images get; how fast these learn has not been measured. From the state,
-# the task's own reward for reaching is so wide (0.2 m) that closed fingers on top of the cube get 98 %
-# of it, and a gripper takes half a second to open or to close. So training has a narrow one beside it,
-# which only open fingers around the cube can get, and contacts without rolling and torsional friction.
-# Evaluations, `evaluate` and `play` have neither.
 
 _REACH, _NARROW_REACH = "lift", "lift_narrow"
 _NARROW_STD = 0.04
@@ -73,8 +63,6 @@ cpu = cpu_profile(_reward_narrow_reach, simple_contacts=True, **_SHARED)
 cpu_vision = cpu_profile(_evaluate_from_images, num_envs=256, **_SHARED)
 """Profile of the tasks from images."""
 
-
-# MERGED mjlab.tasks.manipulation.config.yam.rl_cfg: What evaluations of the manipulation tasks measure: whether, and how well, objects are placed.
 
 _COMMAND = "lift_height"
 

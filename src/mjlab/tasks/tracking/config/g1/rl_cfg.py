@@ -1,4 +1,18 @@
-"""How the Unitree G1 learns to imitate."""
+"""How the Unitree G1 learns to imitate: PPO, and the `cpu` profile.
+
+A few cores step some thousands of environments a second, a hundredth of a GPU. A humanoid with soft
+drives falls within a second unless it balances, and that is what takes most of the learning. So the
+profile makes the task easier to learn, not easier to pass:
+
+- Starts are perturbed, and robots pushed, by nothing at first and by as much as in the task later; the
+  penalty for quick actions grows likewise.
+- The physics takes two steps of 10 ms for a step of the environment, instead of four of 5 ms.
+- The policy starts out as a position controller on the reference (`ReferenceActor`).
+- Batches and networks are small, a policy may change more in an iteration, and rewards far away count
+  less.
+
+Evaluations, `play` and `evaluate` undo the first two: what they show is the task as it is.
+"""
 
 from __future__ import annotations
 
@@ -17,27 +31,35 @@ from mjlab.tasks.easing import Easing, Undo, ease_weight
 from mjlab.tasks.tracking.mdp.commands import motion_command
 from mjlab.tasks.tracking.mdp.metrics import TRACKING_ERRORS, play_motions_once
 
-# MERGED mjlab.tasks.tracking.config.g1.rl_cfg: The `cpu` profile: settings of motion tracking for a few cores.
-#
-# A few cores step some thousands of environments a second, a hundredth of a GPU. A humanoid with soft
-# drives falls within a second unless it balances, and that is what takes most of the learning. So the
-# profile makes the task easier to learn, not easier to pass:
-#
-# - Starts are perturbed, and robots pushed, by nothing at first and by as much as in the task later; the
-#   penalty for quick actions grows likewise.
-# - The physics takes two steps of 10 ms for a step of the environment, instead of four of 5 ms.
-# - The policy starts out as a position controller on the reference (`ReferenceActor`).
-# - Batches and networks are small, a policy may change more in an iteration, and rewards far away count
-#   less.
-#
-# Evaluations, `play` and `evaluate` undo the first two: what they show is the task as it is.
-
 _COMMAND = "motion"
 _ACTION_RATE = "action_rate_l2"
 _NUM_ENVS = 512
 _ACTION_RATE_AT_FIRST = 0.05
 _ACTION_RATE_SAMPLES = 6_000_000
 _CALM_SAMPLES = 4_000_000
+
+
+def unitree_g1_tracking_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
+    """Return the PPO settings of both tasks."""
+    return RslRlOnPolicyRunnerCfg(
+        actor=RslRlModelCfg(
+            hidden_dims=(512, 256, 128),
+            obs_normalization=True,
+            distribution_cfg=gaussian_distribution(),
+        ),
+        critic=RslRlModelCfg(hidden_dims=(512, 256, 128), obs_normalization=True),
+        experiment_name="g1_tracking",
+        save_interval=500,
+        max_iterations=30_000,
+        evaluation=EvaluationCfg(
+            metrics=dict(TRACKING_ERRORS),
+            prepare_env=play_motions_once,
+            success_is_survival=True,
+        ),
+    )
+
+
+# The cpu profile.
 
 
 def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> Undo:
@@ -84,23 +106,3 @@ cpu = cpu_profile(
     unpushed_samples=12_000_000,
 )
 """Profile of the tracking tasks."""
-
-
-def unitree_g1_tracking_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
-    """Return the PPO settings of both tasks."""
-    return RslRlOnPolicyRunnerCfg(
-        actor=RslRlModelCfg(
-            hidden_dims=(512, 256, 128),
-            obs_normalization=True,
-            distribution_cfg=gaussian_distribution(),
-        ),
-        critic=RslRlModelCfg(hidden_dims=(512, 256, 128), obs_normalization=True),
-        experiment_name="g1_tracking",
-        save_interval=500,
-        max_iterations=30_000,
-        evaluation=EvaluationCfg(
-            metrics=dict(TRACKING_ERRORS),
-            prepare_env=play_motions_once,
-            success_is_survival=True,
-        ),
-    )

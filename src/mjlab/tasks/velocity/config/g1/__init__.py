@@ -29,7 +29,7 @@ for _terrain in ("Flat", "Rough"):
         env_cfg=f"{_ENV_CFGS}:unitree_g1_{_terrain.lower()}_env_cfg",
         rl_cfg=f"{_RL_CFG}:unitree_g1_ppo_runner_cfg",
         runner_cls=f"{_RUNNER}:VelocityOnPolicyRunner",
-        profiles={"cpu": "mjlab.tasks.velocity.config.g1.cpu_profile:cpu"},
+        profiles={"cpu": f"{_RL_CFG}:cpu"},
     )
 
 __getattr__ = lazy_names(

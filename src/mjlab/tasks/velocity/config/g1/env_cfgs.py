@@ -67,7 +67,17 @@ def unitree_g1_rough_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     assert terrain.terrain_generator is not None
     terrain.terrain_generator.curriculum = True
     _set_sensors(cfg)
-    _set_terms(cfg)
+    joint_pos, twist = cfg.actions["joint_pos"], cfg.commands["twist"]
+    assert isinstance(joint_pos, mdp.JointPositionActionCfg)
+    joint_pos.scale = dict(G1_ACTION_SCALE)
+    assert isinstance(twist, mdp.UniformVelocityCommandCfg)
+    # Above the head.
+    twist.viz.z_offset = 1.15
+    friction, base_com = cfg.events["foot_friction"], cfg.events["base_com"]
+    assert friction is not None
+    friction.params["asset_cfg"].geom_names = _FOOT_GEOMS
+    assert base_com is not None
+    base_com.params["asset_cfg"].body_names = (_TORSO,)
     _set_rewards(cfg)
     cfg.viewer.body_name = _TORSO
     if play:
@@ -112,20 +122,6 @@ def _set_sensors(cfg: ManagerBasedRlEnvCfg) -> None:
         history_length=4,
     )
     cfg.scene.sensors += (feet_ground_contact, self_collision)
-
-
-def _set_terms(cfg: ManagerBasedRlEnvCfg) -> None:
-    joint_pos, twist = cfg.actions["joint_pos"], cfg.commands["twist"]
-    assert isinstance(joint_pos, mdp.JointPositionActionCfg)
-    joint_pos.scale = dict(G1_ACTION_SCALE)
-    assert isinstance(twist, mdp.UniformVelocityCommandCfg)
-    # Above the head.
-    twist.viz.z_offset = 1.15
-    friction, base_com = cfg.events["foot_friction"], cfg.events["base_com"]
-    assert friction is not None
-    friction.params["asset_cfg"].geom_names = _FOOT_GEOMS
-    assert base_com is not None
-    base_com.params["asset_cfg"].body_names = (_TORSO,)
 
 
 def _set_rewards(cfg: ManagerBasedRlEnvCfg) -> None:

@@ -1,11 +1,268 @@
-"""How the Unitree G1 learns the velocity tasks."""
+"""How the Unitree G1 learns the velocity tasks: PPO, and the `cpu` profile.
+
+With the profile, a humanoid learns to walk on two cores. PPO does not get there in an hour, so the learner is
+the off-policy one (`mjlab.rl.sac`), and the task is made easier to learn, not easier to pass.
+`docs/learning.md` has the experiments.
+
+- A controller from a textbook steps in place (`stepping_action`). It acts for the first 60 environment steps, and the
+  policy imitates it, less and less, for the first 1,200 of some 3,000. Without it, policies learn to stand and
+  no more.
+- Actions are bounded, and policies observe a gait clock and the last five velocities, turning rates and
+  directions of gravity, to filter sensor noise. They keep all three.
+- Rewards say what a gait is: feet as high as the clock says and not in each other's way, a pelvis that
+  neither sinks nor tips, joints near the default pose. The penalties of the task are there too.
+- Commands and pushes grow as the robot copes with them.
+- The physics takes three steps for a step of the environment, and feet have two capsules instead of seven.
+  Legs and hands do collide: without that, feet walk through one another. The solver keeps its iterations:
+  with four, feet slip on ground that is not slippery.
+
+Evaluations, `evaluate` and `play` have the task's own physics, rewards, commands, pushes, noise and ends.
+"""
 
 from __future__ import annotations
 
-from mjlab.rl.config import RslRlOnPolicyRunnerCfg
+import copy
+import math
+
+from mjlab.asset_zoo.robots.unitree_g1.g1_constants import FULL_COLLISION
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.envs import mdp as envs_mdp
+from mjlab.managers import (
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    RewardTermCfg,
+    SceneEntityCfg,
+    TerminationTermCfg,
+)
+from mjlab.rl.config import (
+    RslRlBaseRunnerCfg,
+    RslRlOffPolicyRunnerCfg,
+    RslRlOnPolicyRunnerCfg,
+    squashed_gaussian,
+)
+from mjlab.rl.learners import with_learner
+from mjlab.tasks.easing import (
+    Undo,
+    coarsen_physics,
+    drop_easing,
+    grow_difficulty,
+    replace_rewards,
+    undo_all,
+)
+from mjlab.tasks.velocity import mdp
 from mjlab.tasks.velocity.rl.ppo import velocity_ppo_runner_cfg
+
+_NUM_ENVS = 1024
+_FEET = SceneEntityCfg("robot", site_names=("left_foot", "right_foot"))
+_CLOCK = "gait"
+_TEACHER = "teacher"
+_LINEAR = "linear"
+_STRIDES_PER_SECOND = 1.88
+"""Strides per second of the stepping controller's gains."""
+# Observations that are shown with the steps before, as a filter of their noise.
+_FILTERED = ("base_lin_vel", "base_ang_vel", "projected_gravity")
+_HISTORY = 5
+# Largest distance of a target from the default pose (rad).
+_BOUNDS = {
+    r".*_(hip_pitch|knee|ankle_pitch)_joint": 1.0,
+    r".*_hip_(roll|yaw)_joint": 0.6,
+    r".*_ankle_roll_joint": 0.8,
+    r"waist_.*_joint": 0.25,
+    r".*_shoulder_pitch_joint": 0.4,
+    r".*_shoulder_(roll|yaw)_joint": 0.2,
+    r".*_elbow_joint": 0.3,
+    r".*_wrist_.*_joint": 0.1,
+}
+# Weights of squared distances from the default pose, as UniLab's (arXiv 2605.30313) G1 has them.
+_POSE = {
+    r".*_(hip_pitch|knee)_joint": 0.01,
+    r".*_hip_roll_joint": 1.0,
+    r".*_(hip_yaw|ankle_pitch|ankle_roll)_joint": 5.0,
+    r"(waist|.*_shoulder|.*_elbow|.*_wrist)_.*": 50.0,
+}
+# Geoms that collide: the long capsules of the feet, and what they or the hands may hit.
+_FOOT = r"^(left|right)_foot[26]_collision$"
+_LIMBS = tuple(
+    rf".*_{part}_collision" for part in ("shin", "linkage_brace", "thigh", "hip", "hand", "wrist")
+)
 
 
 def unitree_g1_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
     """Return the PPO settings of both tasks."""
     return velocity_ppo_runner_cfg(experiment_name="g1_velocity", max_iterations=30_000)
+
+
+def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> RslRlBaseRunnerCfg:
+    """Edit the task's config in place, and return that of the learner.
+
+    Solved means that it walks: four of five episodes last for 20 s, with the task's pushes.
+    """
+    env_cfg.scene.num_envs = _NUM_ENVS
+    _let_step(env_cfg)
+    undos = [
+        drop_easing,
+        coarsen_physics(env_cfg, num_steps=3),
+        _collide_less(env_cfg),
+        _shape_rewards(env_cfg),
+        _end_early(env_cfg),
+    ]
+    grow_difficulty(
+        env_cfg,
+        _LINEAR,
+        tracking=0.4,
+        survival=0.6,
+        survival_s=6.0,
+        interval=25,
+        command_from=0.6,
+        push_from=0.1,
+        noise_from=1.0,
+    )
+    cfg = _learner(rl_cfg)
+    cfg.evaluation.prepare_env = undo_all(undos)
+    return cfg
+
+
+def _let_step(env_cfg: ManagerBasedRlEnvCfg) -> None:
+    """Bound actions, add clock and history to the observations, and the stepping controller as teacher."""
+    env_cfg.commands[_CLOCK] = mdp.GaitClockCommandCfg(
+        frequency=_STRIDES_PER_SECOND, starts=(0.0, 0.5), fade_s=0.3, velocity_command_name=None
+    )
+    for group in env_cfg.observations.values():
+        assert group is not None
+        group.terms[_CLOCK] = ObservationTermCfg(
+            func=mdp.generated_commands, params={"command_name": _CLOCK}
+        )
+    actor = env_cfg.observations["actor"]
+    assert actor is not None
+    for name in _FILTERED:
+        term = actor.terms[name]
+        assert term is not None
+        term.history_length = _HISTORY
+    env_cfg.observations[_TEACHER] = ObservationGroupCfg(
+        terms={"step": ObservationTermCfg(func=mdp.stepping_action)}
+    )
+    env_cfg.actions["joint_pos"] = envs_mdp.JointPositionActionCfg(
+        entity_name="robot", actuator_names=(".*",), scale=dict(_BOUNDS)
+    )
+
+
+def _collide_less(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
+    robot = env_cfg.scene.entities["robot"]
+    before = robot.collisions
+    fewer = copy.deepcopy(FULL_COLLISION)
+    fewer.geom_names_expr = (_FOOT, *_LIMBS)
+    robot.collisions = (fewer,)
+
+    def undo(eased: ManagerBasedRlEnvCfg) -> None:
+        if eased.scene.entities["robot"].collisions == (fewer,):
+            eased.scene.entities["robot"].collisions = before
+
+    return undo
+
+
+def _shape_rewards(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
+    """Replace what the task rewards, and add to what it penalizes."""
+    twist = {"command_name": "twist"}
+    penalties = {
+        name: term
+        for name, term in env_cfg.rewards.items()
+        if term is not None and term.weight < 0.0
+    }
+    rewards = {
+        # The narrow one alone pays nothing for a first step, the wide one too little for the last.
+        _LINEAR: RewardTermCfg(
+            func=mdp.track_linear_velocity, weight=3.0, params={"std": 0.5, **twist}
+        ),
+        "linear_wide": RewardTermCfg(
+            func=mdp.track_linear_velocity, weight=3.0, params={"std": 1.0, **twist}
+        ),
+        "angular": RewardTermCfg(
+            func=mdp.track_angular_velocity, weight=4.5, params={"std": 0.5, **twist}
+        ),
+        "alive": RewardTermCfg(func=envs_mdp.is_alive, weight=4.0),
+        "feet": RewardTermCfg(
+            func=mdp.feet_height_by_phase,
+            weight=5.0,
+            params={"height_sensor_name": "foot_height_scan"},
+        ),
+        "height": RewardTermCfg(
+            func=mdp.root_height_l2,
+            weight=-50.0,
+            params={"target_height": 0.74, "asset_cfg": copy.deepcopy(_FEET)},
+        ),
+        "apart": RewardTermCfg(
+            func=mdp.feet_apart_l2,
+            weight=-100.0,
+            params={"distance": 0.2, "asset_cfg": copy.deepcopy(_FEET)},
+        ),
+        "rolling": RewardTermCfg(func=mdp.body_angular_velocity_penalty, weight=-0.5),
+        "tilt": RewardTermCfg(func=envs_mdp.flat_orientation_l2, weight=-5.0),
+        "deviation": RewardTermCfg(
+            func=mdp.weighted_joint_deviation, weight=-0.25, params={"weights": dict(_POSE)}
+        ),
+        "soles": RewardTermCfg(
+            func=mdp.feet_tilt, weight=-2.5, params={"asset_cfg": copy.deepcopy(_FEET)}
+        ),
+        **penalties,
+        "action_rate_l2": RewardTermCfg(func=envs_mdp.action_rate_l2, weight=-0.5),
+        "dof_pos_limits": RewardTermCfg(func=envs_mdp.joint_pos_limits, weight=-2.5),
+    }
+    return replace_rewards(env_cfg, rewards)
+
+
+def _end_early(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
+    """End episodes before all is lost: what follows teaches little."""
+    fell = env_cfg.terminations["fell_over"]
+    assert fell is not None
+    before, early = fell.params["limit_angle"], math.radians(60.0)
+    fell.params["limit_angle"] = early
+    env_cfg.terminations["sank"] = TerminationTermCfg(
+        func=mdp.root_near_feet,
+        params={"minimum_height": 0.5, "asset_cfg": copy.deepcopy(_FEET)},
+    )
+
+    def undo(eased: ManagerBasedRlEnvCfg) -> None:
+        eased.terminations.pop("sank", None)
+        fell = eased.terminations.get("fell_over")
+        if fell is not None and fell.params["limit_angle"] == early:
+            fell.params["limit_angle"] = before
+
+    return undo
+
+
+def _learner(rl_cfg: RslRlOnPolicyRunnerCfg) -> RslRlOffPolicyRunnerCfg:
+    cfg = with_learner(rl_cfg, "sac")
+    assert isinstance(cfg, RslRlOffPolicyRunnerCfg)
+    cfg.num_steps_per_env = 25
+    cfg.max_iterations = 400
+    cfg.save_interval = 20
+    cfg.actor.hidden_dims = cfg.critic.hidden_dims = (256, 128, 64)
+    cfg.actor.distribution_cfg = squashed_gaussian(0.15, log_std_max=-1.2)
+    algorithm = cfg.algorithm
+    # Five updates of 2,048 take as long as the physics of 1,024 environments: ten uses of a transition.
+    algorithm.num_updates = 5
+    algorithm.replay_steps = 600
+    algorithm.learning_starts = 20
+    algorithm.value_range = (-5.0, 15.0)
+    algorithm.tau = 0.08
+    algorithm.actor_learning_rate = 1.5e-3
+    algorithm.critic_learning_rate = 6e-4
+    algorithm.init_alpha = 0.002
+    algorithm.alpha_learning_rate = 1e-2
+    algorithm.alpha_range = (1e-5, 0.05)
+    algorithm.mean_penalty = 0.02
+    algorithm.policy_average = 0.05
+    algorithm.use_mixed_precision = True
+    algorithm.teacher = _TEACHER
+    algorithm.teacher_steps = 60
+    algorithm.imitation = ((100, 2.0), (400, 0.1), (800, 0.1), (1200, 0.0))
+    algorithm.symmetry_cfg = {
+        "data_augmentation_func": "mjlab.tasks.velocity.symmetry:mirror_left_right"
+    }
+    evaluation = cfg.evaluation
+    evaluation.num_episodes = 100
+    # An evaluation takes as long as four iterations, and before that policies fall too often.
+    evaluation.first_iteration, evaluation.min_interval = 80, 10
+    evaluation.trigger_return = -math.inf
+    evaluation.solved_below = {"lin_vel_error": 0.35, "ang_vel_error": 0.45, "failure_rate": 0.2}
+    return cfg

@@ -26,7 +26,7 @@ _RUNNER = "mjlab.tasks.velocity.rl"
 for _terrain in ("Flat", "Rough"):
     _profiles = {"cpu": "mjlab.tasks.velocity.rl.ppo:cpu"}
     if _terrain == "Rough":
-        _profiles["blind"] = "mjlab.tasks.velocity.config.blind_profile:blind"
+        _profiles["blind"] = "mjlab.tasks.velocity.rl.ppo:blind"
     register_mjlab_task(
         task_id=f"Mjlab-Velocity-{_terrain}-Unitree-Go1",
         env_cfg=f"{_ENV_CFGS}:unitree_go1_{_terrain.lower()}_env_cfg",

@@ -30,7 +30,10 @@ _FOOT_GEOMS = tuple(f"{foot}_foot_collision" for foot in _FEET)
 def unitree_go1_rough_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     """Return the task on rough terrain, to train or to `play` with."""
     cfg = make_velocity_env_cfg()
-    _set_physics(cfg)
+    cfg.sim.mujoco.ccd_iterations = 500
+    cfg.sim.mujoco.impratio = 10
+    cfg.sim.mujoco.cone = "elliptic"
+    cfg.sim.contact_sensor_maxmatch = 500
     cfg.scene.entities = {"robot": get_go1_robot_cfg()}
     terrain = cfg.scene.terrain
     assert terrain is not None
@@ -65,13 +68,6 @@ def unitree_go1_flat_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     fell_over = make_velocity_env_cfg().terminations["fell_over"]
     cfg.terminations["fell_over"] = fell_over
     return cfg
-
-
-def _set_physics(cfg: ManagerBasedRlEnvCfg) -> None:
-    cfg.sim.mujoco.ccd_iterations = 500
-    cfg.sim.mujoco.impratio = 10
-    cfg.sim.mujoco.cone = "elliptic"
-    cfg.sim.contact_sensor_maxmatch = 500
 
 
 def _set_sensors(cfg: ManagerBasedRlEnvCfg) -> None:

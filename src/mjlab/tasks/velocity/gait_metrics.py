@@ -10,8 +10,6 @@ from typing import Any
 
 import torch
 
-from mjlab.managers.term_checks import require_sensor
-from mjlab.sensor import TerrainHeightSensor
 from mjlab.tasks.velocity.mdp.observations import (
     check_feet_sensor,
     check_same_feet,
@@ -81,21 +79,20 @@ def foot_slip(env: Any) -> torch.Tensor:
         ValueError: one of these sensors does not exist, or they are of other feet.
     """
     check_feet_sensor(env, _CONTACTS)
-    frame = require_sensor(env, _HEIGHTS, TerrainHeightSensor).cfg.frame
+    feet = height_columns(env, _HEIGHTS)
     check_same_feet(
         env,
         (f"The contact sensor {_CONTACTS!r}", contact_columns(env, _CONTACTS)),
-        (f"the height sensor {_HEIGHTS!r}", height_columns(env, _HEIGHTS)),
+        (f"the height sensor {_HEIGHTS!r}", feet),
     )
     in_contact = env.scene[_CONTACTS].data.found > 0
     robot = env.scene[_ROBOT]
-    names = [ref.name for ref in (frame if isinstance(frame, tuple) else (frame,))]
-    sites = as_columns([robot.site_names.index(name) for name in names], env.device)
+    sites = as_columns([robot.site_names.index(name) for name, _ in feet], env.device)
     speed = robot.data.site_lin_vel_w[:, sites, :2].norm(dim=-1)
     return (speed * in_contact).sum(dim=1) / in_contact.sum(dim=1).clamp(min=1)
 
 
-GAIT_FIGURES = {
+GAIT_METRICS = {
     "joint_torque": joint_torque,
     "torque_share": torque_share,
     "mechanical_power": mechanical_power,
