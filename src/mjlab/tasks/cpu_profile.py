@@ -67,8 +67,13 @@ def cpu_profile(
     def profile(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
         # Not before it is used: a task is registered without torch.
         from mjlab.rl.config import gaussian_distribution
-        from mjlab.tasks.easing import coarsen_physics, drop_easing, ease_pushes, undo_all
-        from mjlab.tasks.simple_contacts import simplify_contacts
+        from mjlab.tasks.easing import (
+            coarsen_physics,
+            drop_easing,
+            ease_pushes,
+            simplify_contacts,
+            undo_all,
+        )
 
         env_cfg.scene.num_envs = num_envs
         undos = [drop_easing]

@@ -4,12 +4,15 @@ A task is registered with its configs, or, so that listing tasks costs nothing, 
 the functions that make them. Tasks come from the folders of `mjlab.tasks` and from installed
 packages that declare an entry point in the group `mjlab.tasks`; they are discovered when the
 registry is first asked.
+
+A task that needs something (a recorded motion, say) is registered with a dataclass, `options=`, whose
+fields become flags of `train`, `play`, `evaluate` and `profile-env` for this task. The scripts know
+nothing of what is in it: they call `prepare` before they build the environment.
 """
 
 from __future__ import annotations
 
 import copy
-import difflib
 import functools
 import importlib
 import inspect
@@ -25,6 +28,7 @@ from typing import TYPE_CHECKING, Any
 
 from mjlab.compat import older_names
 from mjlab.utils.errors import MjlabError, UnknownNameError
+from mjlab.utils.string import suggest
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -33,71 +37,10 @@ if TYPE_CHECKING:
 
     Profile = Callable[[Any, Any], RslRlBaseRunnerCfg | None]
 
-
-@dataclass(frozen=True)
-class PolicyOrigin:
-    """Where the policy comes from that is to act, as far as there is one."""
-
-    task: str
-    """Name of the task."""
-    checkpoint: Path | None = None
-    """Its checkpoint, in the folder of its run; also the one that training goes on from."""
-    wandb_run_path: str | None = None
-    """The Weights & Biases run that the checkpoint was fetched from, as entity/project/run."""
-
-
-@dataclass
-class TaskOptions:
-    """Base of the options of a task: a dataclass with a default for each field."""
-
-    def prepare(self, env_cfg: Any, origin: PolicyOrigin) -> None:
-        """Edit the environment's config in place, fetching what it needs.
-
-        Called once, before the environment is built; by every process where there are several.
-
-        Args:
-            env_cfg: The config, with all flags applied.
-            origin: Whose policy is to act.
-
-        Raises:
-            ValueError: what is needed is not there; the message says what to do.
-        """
-
-    def runner_kwargs(self) -> dict[str, Any]:
-        """Return further keyword arguments of the task's runner."""
-        return {}
-
-
 logger = logging.getLogger(__name__)
 ENTRY_POINT_GROUP = "mjlab.tasks"
-
 # Modules that every 1.x release brought along, and that are an extra here.
 _COMPAT_MODULES = frozenset({"torchrunx", "mediapy", "moviepy"})
-
-
-class UnknownTaskError(UnknownNameError):
-    """Raised for a task name that is not registered; the message lists the nearest ones."""
-
-
-class UnknownProfileError(MjlabError, ValueError):
-    """Raised for a profile that a task does not have; the message lists those it has."""
-
-
-class TaskImportError(MjlabError, RuntimeError):
-    """Raised for a task whose config, runner or profile, given by name, cannot be imported."""
-
-
-@dataclass(frozen=True)
-class _Task:
-    env_cfg: Any
-    play_env_cfg: Any
-    rl_cfg: Any
-    runner_cls: Any
-    profiles: dict[str, Any]
-    options: Any
-    source: str | None
-
-
 _tasks: dict[str, _Task] = {}
 _discovered = False
 
@@ -213,6 +156,111 @@ def load_rl_cfg(
     return with_learner(cfg, learner)
 
 
+def load_runner_cls(task_name: str) -> type | None:
+    """Return the runner class of a task, or None for the default one; raises likewise."""
+    runner_cls = _find(task_name).runner_cls
+    return _imported(task_name, runner_cls) if isinstance(runner_cls, str) else runner_cls
+
+
+def load_options_cls(task_name: str) -> type[TaskOptions] | None:
+    """Return the class of a task's own options, or None if it has none; raises likewise."""
+    options = _find(task_name).options
+    return _imported(task_name, options) if isinstance(options, str) else options
+
+
+def require_profile(task_name: str, profile: str) -> Profile | str:
+    """Return what a profile was registered with.
+
+    Raises:
+        UnknownTaskError: no such task.
+        UnknownProfileError: no such profile; the message lists the task's.
+    """
+    profiles = _find(task_name).profiles
+    if profile in profiles:
+        return profiles[profile]
+    there = f"its profiles are: {', '.join(sorted(profiles))}" if profiles else "it has none"
+    raise UnknownProfileError(
+        f"Task {task_name!r} has no profile {profile!r}; {there}. Without --profile the task's "
+        "own settings are used."
+    )
+
+
+def require_task(task_name: str) -> None:
+    """Raise UnknownTaskError, listing the nearest names, unless the task is registered."""
+    _find(task_name)
+
+
+def task_source(task_name: str) -> str | None:
+    """Return the file that registered a task; None if that was no file. Raises UnknownTaskError."""
+    return _find(task_name).source
+
+
+# Options: what a task adds to the command line.
+
+
+@dataclass
+class TaskOptions:
+    """Base of the options of a task: a dataclass with a default for each field."""
+
+    def prepare(self, env_cfg: Any, origin: PolicyOrigin) -> None:
+        """Edit the environment's config in place, fetching what it needs.
+
+        Called once, before the environment is built; by every process where there are several.
+
+        Args:
+            env_cfg: The config, with all flags applied.
+            origin: Whose policy is to act.
+
+        Raises:
+            ValueError: what is needed is not there; the message says what to do.
+        """
+
+    def runner_kwargs(self) -> dict[str, Any]:
+        """Return further keyword arguments of the task's runner."""
+        return {}
+
+
+@dataclass(frozen=True)
+class PolicyOrigin:
+    """Where the policy comes from that is to act, as far as there is one."""
+
+    task: str
+    """Name of the task."""
+    checkpoint: Path | None = None
+    """Its checkpoint, in the folder of its run; also the one that training goes on from."""
+    wandb_run_path: str | None = None
+    """The Weights & Biases run that the checkpoint was fetched from, as entity/project/run."""
+
+
+# Errors.
+
+
+class UnknownTaskError(UnknownNameError):
+    """Raised for a task name that is not registered; the message lists the nearest ones."""
+
+
+class UnknownProfileError(MjlabError, ValueError):
+    """Raised for a profile that a task does not have; the message lists those it has."""
+
+
+class TaskImportError(MjlabError, RuntimeError):
+    """Raised for a task whose config, runner or profile, given by name, cannot be imported."""
+
+
+# Making configs, and finding what registers tasks.
+
+
+@dataclass(frozen=True)
+class _Task:
+    env_cfg: Any
+    play_env_cfg: Any
+    rl_cfg: Any
+    runner_cls: Any
+    profiles: dict[str, Any]
+    options: Any
+    source: str | None
+
+
 def _with_profile(
     task_name: str, profile: str, play: bool
 ) -> tuple[ManagerBasedRlEnvCfg, RslRlBaseRunnerCfg, RslRlBaseRunnerCfg]:
@@ -244,52 +292,12 @@ def _with_profile(
     return env_cfg, rl_cfg if rl_cfg is given else copy.deepcopy(rl_cfg), given
 
 
-def require_profile(task_name: str, profile: str) -> Profile | str:
-    """Return what a profile was registered with.
-
-    Raises:
-        UnknownTaskError: no such task.
-        UnknownProfileError: no such profile; the message lists the task's.
-    """
-    profiles = _find(task_name).profiles
-    if profile in profiles:
-        return profiles[profile]
-    there = f"its profiles are: {', '.join(sorted(profiles))}" if profiles else "it has none"
-    raise UnknownProfileError(
-        f"Task {task_name!r} has no profile {profile!r}; {there}. Without --profile the task's "
-        "own settings are used."
-    )
-
-
-def load_runner_cls(task_name: str) -> type | None:
-    """Return the runner class of a task, or None for the default one; raises likewise."""
-    runner_cls = _find(task_name).runner_cls
-    return _imported(task_name, runner_cls) if isinstance(runner_cls, str) else runner_cls
-
-
-def load_options_cls(task_name: str) -> type[TaskOptions] | None:
-    """Return the class of a task's own options, or None if it has none; raises likewise."""
-    options = _find(task_name).options
-    return _imported(task_name, options) if isinstance(options, str) else options
-
-
-def task_source(task_name: str) -> str | None:
-    """Return the file that registered a task; None if that was no file. Raises UnknownTaskError."""
-    return _find(task_name).source
-
-
-def require_task(task_name: str) -> None:
-    """Raise UnknownTaskError, listing the nearest names, unless the task is registered."""
-    _find(task_name)
-
-
 def _find(task_name: str) -> _Task:
     _discover()
     if task_name not in _tasks:
-        near = difflib.get_close_matches(task_name, _tasks, n=3, cutoff=0.4)
-        hint = f" Did you mean {' or '.join(near)}?" if near else ""
         raise UnknownTaskError(
-            f"Unknown task {task_name!r}.{hint} `list-envs` shows all {len(_tasks)} tasks."
+            f"Unknown task {task_name!r}; {suggest(task_name, _tasks)} `list-envs` shows all "
+            f"{len(_tasks)} tasks."
         )
     return _tasks[task_name]
 

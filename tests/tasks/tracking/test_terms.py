@@ -221,7 +221,7 @@ def set_param(kind, name, **params):
         (set_param("rewards", "motion_body_pos", std=0.0), "std.*0.0"),
         (set_param("rewards", "motion_body_pos", command_name="twist"), "command 'twist'"),
         (set_param("terminations", "ee_body_pos", body_names=("hand",)), r"\['hand'\], which are"),
-        (set_param("terminations", "anchor_pos", threshold=-1.0), "threshold is -1.0"),
+        (set_param("terminations", "anchor_pos", threshold=-1.0), "threshold.*-1.0"),
     ],
 )
 def test_terms_that_could_not_work_are_refused_when_the_task_is_built(edit, message):

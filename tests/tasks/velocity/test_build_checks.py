@@ -169,7 +169,7 @@ def test_heights_of_rays_are_no_heights_of_feet(make_env):
     [
         ("track_linear_velocity", "std", -0.5, "std.*-0.5"),
         ("track_angular_velocity", "std", 0.0, "std.*0.0"),
-        ("foot_swing_height", "target_height", 0.0, "target_height is 0.0"),
+        ("foot_swing_height", "target_height", 0.0, "target_height.*0.0"),
         ("air_time", "threshold_min", 0.5, "no air time is between them"),
     ],
 )
@@ -203,5 +203,5 @@ def test_upright_needs_rays_of_a_sensor_that_exists(make_env):
 def test_an_unknown_sensor_of_a_config_is_named_with_those_that_exist():
     from velocity_tasks import task_cfg
 
-    with pytest.raises(KeyError, match=r"No sensor 'scan'; there are \['foot_height_scan'"):
+    with pytest.raises(KeyError, match=r"sensor 'scan'.*'foot_height_scan'"):
         get_sensor(task_cfg(), "scan")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mjlab.tasks.registry import register_mjlab_task
+from mjlab.utils.lazy import lazy_names
 
 if TYPE_CHECKING:
     from mjlab.tasks.cartpole.cartpole_env_cfg import (
@@ -29,13 +30,13 @@ register_mjlab_task(
     task_id="Mjlab-Cartpole-Swingup",
     env_cfg=f"{_CFG}:cartpole_swingup_env_cfg",
     rl_cfg=f"{_CFG}:cartpole_ppo_runner_cfg",
-    profiles={"cpu": "mjlab.tasks.cartpole.cpu_profile:cpu"},
+    profiles={"cpu": f"{_CFG}:cpu"},
 )
 
 
-def __getattr__(name: str) -> Any:
-    if name.startswith("cartpole_"):
-        import importlib
-
-        return getattr(importlib.import_module(_CFG), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazy_names(
+    __name__,
+    dict.fromkeys(
+        ("cartpole_balance_env_cfg", "cartpole_ppo_runner_cfg", "cartpole_swingup_env_cfg"), _CFG
+    ),
+)

@@ -6,6 +6,7 @@ are those of the DeepMind Control Suite (Tassa et al., 2018, https://arxiv.org/a
 
 from __future__ import annotations
 
+import copy
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,6 +40,7 @@ from mjlab.rl.config import (
 )
 from mjlab.scene import SceneCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
+from mjlab.tasks.cpu_profile import cpu_profile
 from mjlab.terrains import TerrainEntityCfg
 from mjlab.utils.indexing import as_columns
 from mjlab.viewer import ViewerConfig
@@ -47,180 +49,7 @@ if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
 
-# The model.
-
 _CARTPOLE_XML = Path(__file__).parent / "cartpole.xml"
-
-
-def _get_spec() -> mujoco.MjSpec:
-    return mujoco.MjSpec.from_file(str(_CARTPOLE_XML))
-
-
-# The motor of the XML is used as it is.
-_ARTICULATION = EntityArticulationInfoCfg(
-    actuators=(XmlActuatorCfg(target_names_expr=("slider",)),),
-)
-
-_SWINGUP_INIT = EntityCfg.InitialStateCfg(
-    joint_pos={"slider": 0.0, "hinge_1": math.pi},
-    joint_vel={".*": 0.0},
-)
-
-_BALANCE_INIT = EntityCfg.InitialStateCfg(
-    joint_pos={"slider": 0.0, "hinge_1": 0.0},
-    joint_vel={".*": 0.0},
-)
-
-
-def _get_cartpole_cfg(swing_up: bool) -> EntityCfg:
-    return EntityCfg(
-        spec_fn=_get_spec,
-        articulation=_ARTICULATION,
-        init_state=_SWINGUP_INIT if swing_up else _BALANCE_INIT,
-    )
-
-
-# Terms of its own.
-
-
-def _joint(name: str) -> SceneEntityCfg:
-    return SceneEntityCfg("cartpole", joint_names=(name,))
-
-
-_CART = _joint("slider")
-_HINGE = _joint("hinge_1")
-
-
-def pole_angle_cos_sin(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _HINGE) -> torch.Tensor:
-    """Return cosine and sine of the hinge angle, (N, 2).
-
-    The angle of a hinge without limits grows with every turn; these repeat.
-    """
-    asset: Entity = env.scene[asset_cfg.name]
-    angle = asset.data.joint_pos[:, as_columns(asset_cfg.joint_ids, env.device)]
-    return torch.cat([torch.cos(angle), torch.sin(angle)], dim=-1)
-
-
-def _gaussian_tolerance(x: torch.Tensor, margin: float) -> torch.Tensor:
-    """Return 1 at x = 0, falling along a Gaussian to 0.1 at |x| = margin."""
-    return torch.exp(math.log(0.1) * torch.square(x / margin))
-
-
-def _quadratic_tolerance(x: torch.Tensor, margin: float) -> torch.Tensor:
-    """Return 1 at x = 0, falling along a parabola to 0 at |x| = margin, and 0 beyond."""
-    return (1.0 - torch.square(x / margin)).clamp(min=0.0)
-
-
-def cartpole_smooth_reward(
-    env: ManagerBasedRlEnv,
-    cart_cfg: SceneEntityCfg = _CART,
-    hinge_cfg: SceneEntityCfg = _HINGE,
-) -> torch.Tensor:
-    """Return the control suite's smooth cartpole reward, (N,) in [0, 1].
-
-    With hinge angle t, cart position x, control u and Gaussian and quadratic tolerances g and q:
-
-        r = (cos t + 1) / 2 * (1 + g(x)) / 2 * (4 + q(u)) / 5 * (1 + g(dt/ds)) / 2
-
-    g is 0.1 at 2 m and at 5 rad/s; q is 0 at |u| = 1. As a product, the reward is high only while
-    the pole is upright, the cart centred, the control small and the pole still, all at once.
-    """
-    asset: Entity = env.scene[cart_cfg.name]
-    slider = as_columns(cart_cfg.joint_ids, env.device)
-    hinge = as_columns(hinge_cfg.joint_ids, env.device)
-    cart_pos = asset.data.joint_pos[:, slider].squeeze(-1)
-    control = asset.data.joint_effort_target[:, slider].squeeze(-1)
-    pole_angle = asset.data.joint_pos[:, hinge].squeeze(-1)
-    pole_vel = asset.data.joint_vel[:, hinge].squeeze(-1)
-
-    upright = (torch.cos(pole_angle) + 1.0) / 2.0
-    centered = (1.0 + _gaussian_tolerance(cart_pos, margin=2.0)) / 2.0
-    small_control = (4.0 + _quadratic_tolerance(control, margin=1.0)) / 5.0
-    small_velocity = (1.0 + _gaussian_tolerance(pole_vel, margin=5.0)) / 2.0
-    return upright * centered * small_control * small_velocity
-
-
-# The environments.
-
-
-def _observations(corrupted: bool) -> dict[str, ObservationGroupCfg | None]:
-    def terms() -> dict[str, ObservationTermCfg | None]:
-        return {
-            "cart_pos": ObservationTermCfg(
-                func=joint_pos_rel, params={"asset_cfg": _joint("slider")}
-            ),
-            "pole_angle": ObservationTermCfg(
-                func=pole_angle_cos_sin, params={"asset_cfg": _joint("hinge_1")}
-            ),
-            "cart_vel": ObservationTermCfg(
-                func=joint_vel_rel, params={"asset_cfg": _joint("slider")}
-            ),
-            "pole_vel": ObservationTermCfg(
-                func=joint_vel_rel, params={"asset_cfg": _joint("hinge_1")}
-            ),
-        }
-
-    return {
-        "actor": ObservationGroupCfg(terms(), enable_corruption=corrupted),
-        "critic": ObservationGroupCfg(terms()),
-    }
-
-
-def _reset_events() -> dict[str, EventTermCfg | None]:
-    def reset(joint: str, position_range: tuple[float, float]) -> EventTermCfg:
-        return EventTermCfg(
-            func=reset_joints_by_offset,
-            mode="reset",
-            params={
-                "position_range": position_range,
-                "velocity_range": (-0.01, 0.01),
-                "asset_cfg": _joint(joint),
-            },
-        )
-
-    return {
-        "reset_slider": reset("slider", (-0.1, 0.1)),
-        "reset_hinge": reset("hinge_1", (-0.034, 0.034)),
-    }
-
-
-def _make_env_cfg(swing_up: bool, play: bool) -> ManagerBasedRlEnvCfg:
-    return ManagerBasedRlEnvCfg(
-        scene=SceneCfg(
-            terrain=TerrainEntityCfg(terrain_type="plane"),
-            entities={"cartpole": _get_cartpole_cfg(swing_up)},
-            num_envs=1,
-            env_spacing=4.0,
-        ),
-        observations=_observations(corrupted=not play),
-        actions={
-            "effort": JointEffortActionCfg(
-                entity_name="cartpole", actuator_names=("slider",), scale=1.0
-            ),
-        },
-        events=_reset_events(),
-        rewards={
-            "smooth_reward": RewardTermCfg(
-                func=cartpole_smooth_reward,
-                weight=1.0,
-                params={"cart_cfg": _joint("slider"), "hinge_cfg": _joint("hinge_1")},
-            ),
-        },
-        terminations={"time_out": TerminationTermCfg(func=time_out, time_out=True)},
-        sim=SimulationCfg(mujoco=MujocoCfg(timestep=0.01, disableflags=("contact",))),
-        viewer=ViewerConfig(
-            origin_type=ViewerConfig.OriginType.ASSET_BODY,
-            entity_name="cartpole",
-            body_name="cart",
-            distance=4.0,
-            elevation=-15.0,
-            azimuth=0.0,
-            camera="cartpole/side",
-        ),
-        decimation=5,
-        # Who plays decides when it is over.
-        episode_length_s=1e10 if play else 50.0,
-    )
 
 
 def cartpole_swingup_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
@@ -251,3 +80,162 @@ def cartpole_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
         max_iterations=500,
         evaluation=EvaluationCfg(solved_return=900.0),
     )
+
+
+cpu = cpu_profile(
+    num_steps_per_env=24,
+    hidden_dims=(64, 64),
+    desired_kl=0.05,
+    gamma=0.98,
+    max_iterations=500,
+)
+"""The `cpu` profile of the swing-up. `docs/learning.md` has the experiments."""
+
+
+# The environments.
+
+
+def _make_env_cfg(swing_up: bool, play: bool) -> ManagerBasedRlEnvCfg:
+    return ManagerBasedRlEnvCfg(
+        scene=SceneCfg(
+            terrain=TerrainEntityCfg(terrain_type="plane"),
+            entities={"cartpole": _cartpole(pole_angle=math.pi if swing_up else 0.0)},
+            num_envs=1,
+            env_spacing=4.0,
+        ),
+        observations=_observations(corrupted=not play),
+        actions={
+            "effort": JointEffortActionCfg(
+                entity_name="cartpole", actuator_names=("slider",), scale=1.0
+            ),
+        },
+        events={
+            "reset_slider": _reset("slider", (-0.1, 0.1)),
+            "reset_hinge": _reset("hinge_1", (-0.034, 0.034)),
+        },
+        rewards={
+            "smooth_reward": RewardTermCfg(
+                func=cartpole_smooth_reward,
+                weight=1.0,
+                params={"cart_cfg": _joint("slider"), "hinge_cfg": _joint("hinge_1")},
+            ),
+        },
+        terminations={"time_out": TerminationTermCfg(func=time_out, time_out=True)},
+        sim=SimulationCfg(mujoco=MujocoCfg(timestep=0.01, disableflags=("contact",))),
+        viewer=ViewerConfig(
+            origin_type=ViewerConfig.OriginType.ASSET_BODY,
+            entity_name="cartpole",
+            body_name="cart",
+            distance=4.0,
+            elevation=-15.0,
+            azimuth=0.0,
+            camera="cartpole/side",
+        ),
+        decimation=5,
+        # Play mode: effectively infinite episodes.
+        episode_length_s=1e10 if play else 50.0,
+    )
+
+
+def _cartpole(pole_angle: float) -> EntityCfg:
+    """Return the model, whose pole starts at `pole_angle` (rad); 0 is upright."""
+    return EntityCfg(
+        spec_fn=_get_spec,
+        # The motor of the XML is used as it is.
+        articulation=EntityArticulationInfoCfg(
+            actuators=(XmlActuatorCfg(target_names_expr=("slider",)),)
+        ),
+        init_state=EntityCfg.InitialStateCfg(
+            joint_pos={"slider": 0.0, "hinge_1": pole_angle}, joint_vel={".*": 0.0}
+        ),
+    )
+
+
+def _get_spec() -> mujoco.MjSpec:
+    return mujoco.MjSpec.from_file(str(_CARTPOLE_XML))
+
+
+def _observations(corrupted: bool) -> dict[str, ObservationGroupCfg | None]:
+    terms: dict[str, ObservationTermCfg | None] = {
+        "cart_pos": ObservationTermCfg(func=joint_pos_rel, params={"asset_cfg": _joint("slider")}),
+        "pole_angle": ObservationTermCfg(
+            func=pole_angle_cos_sin, params={"asset_cfg": _joint("hinge_1")}
+        ),
+        "cart_vel": ObservationTermCfg(func=joint_vel_rel, params={"asset_cfg": _joint("slider")}),
+        "pole_vel": ObservationTermCfg(func=joint_vel_rel, params={"asset_cfg": _joint("hinge_1")}),
+    }
+    return {
+        "actor": ObservationGroupCfg(terms, enable_corruption=corrupted),
+        "critic": ObservationGroupCfg(copy.deepcopy(terms)),
+    }
+
+
+def _reset(joint: str, position_range: tuple[float, float]) -> EventTermCfg:
+    return EventTermCfg(
+        func=reset_joints_by_offset,
+        mode="reset",
+        params={
+            "position_range": position_range,
+            "velocity_range": (-0.01, 0.01),
+            "asset_cfg": _joint(joint),
+        },
+    )
+
+
+def _joint(name: str) -> SceneEntityCfg:
+    return SceneEntityCfg("cartpole", joint_names=(name,))
+
+
+# Task-specific MDP terms.
+
+_CART, _HINGE = _joint("slider"), _joint("hinge_1")
+
+
+def pole_angle_cos_sin(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _HINGE) -> torch.Tensor:
+    """Return cosine and sine of the hinge angle, (N, 2).
+
+    The angle of a hinge without limits grows with every turn; these repeat.
+    """
+    asset: Entity = env.scene[asset_cfg.name]
+    angle = asset.data.joint_pos[:, as_columns(asset_cfg.joint_ids, env.device)]
+    return torch.cat([torch.cos(angle), torch.sin(angle)], dim=-1)
+
+
+def cartpole_smooth_reward(
+    env: ManagerBasedRlEnv,
+    cart_cfg: SceneEntityCfg = _CART,
+    hinge_cfg: SceneEntityCfg = _HINGE,
+) -> torch.Tensor:
+    """Return the control suite's smooth cartpole reward, (N,) in [0, 1].
+
+    With pole angle θ and velocity θ̇, cart position x, control u, Gaussian tolerance g and quadratic
+    tolerance q:
+
+        r = (cos θ + 1) / 2 * (1 + g(x)) / 2 * (4 + q(u)) / 5 * (1 + g(θ̇)) / 2
+
+    g is 0.1 at 2 m and at 5 rad/s; q is 0 at |u| = 1. As a product, the reward is high only while
+    the pole is upright, the cart centred, the control small and the pole still, all at once.
+    """
+    data = env.scene[cart_cfg.name].data
+    slider = as_columns(cart_cfg.joint_ids, env.device)
+    hinge = as_columns(hinge_cfg.joint_ids, env.device)
+    x = data.joint_pos[:, slider].squeeze(-1)
+    u = data.joint_effort_target[:, slider].squeeze(-1)
+    theta = data.joint_pos[:, hinge].squeeze(-1)
+    theta_dot = data.joint_vel[:, hinge].squeeze(-1)
+
+    upright = (torch.cos(theta) + 1.0) / 2.0
+    centered = (1.0 + _gaussian_tolerance(x, margin=2.0)) / 2.0
+    small_control = (4.0 + _quadratic_tolerance(u, margin=1.0)) / 5.0
+    small_velocity = (1.0 + _gaussian_tolerance(theta_dot, margin=5.0)) / 2.0
+    return upright * centered * small_control * small_velocity
+
+
+def _gaussian_tolerance(value: torch.Tensor, margin: float) -> torch.Tensor:
+    """Return 1 at 0, falling along a Gaussian to 0.1 at |value| = margin."""
+    return torch.exp(math.log(0.1) * torch.square(value / margin))
+
+
+def _quadratic_tolerance(value: torch.Tensor, margin: float) -> torch.Tensor:
+    """Return 1 at 0, falling along a parabola to 0 at |value| = margin, and 0 beyond."""
+    return (1.0 - torch.square(value / margin)).clamp(min=0.0)

@@ -10,7 +10,6 @@ import copy
 
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.managers import (
-    ActionTermCfg,
     CommandTermCfg,
     CurriculumTermCfg,
     EventTermCfg,
@@ -51,12 +50,27 @@ def make_lift_cube_env_cfg() -> ManagerBasedRlEnvCfg:
         episode_length_s=20.0,
         scene=SceneCfg(
             terrain=TerrainEntityCfg(terrain_type="plane"),
-            sensors=(_hand_on_the_ground(),),
+            # The hand's strongest contact with the ground, in every substep.
+            sensors=(
+                ContactSensorCfg(
+                    name="ee_ground_collision",
+                    primary=ContactMatch(mode="subtree", pattern=_NO_BODY, entity="robot"),
+                    secondary=ContactMatch(mode="body", pattern="terrain"),
+                    fields=("found", "force"),
+                    reduce="maxforce",
+                    num_slots=1,
+                    history_length=4,
+                ),
+            ),
             num_envs=1,
             env_spacing=1.0,
         ),
         observations=_observations(),
-        actions=_actions(),
+        actions={
+            "joint_pos": mdp.JointPositionActionCfg(
+                entity_name="robot", actuator_names=(".*",), scale=0.5, use_default_offset=True
+            )
+        },
         commands=_commands(),
         events=_events(),
         rewards=_rewards(),
@@ -77,19 +91,6 @@ def make_lift_cube_env_cfg() -> ManagerBasedRlEnvCfg:
             elevation=-5.0,
             azimuth=120.0,
         ),
-    )
-
-
-def _hand_on_the_ground() -> ContactSensorCfg:
-    """Return a sensor of the hand's strongest contact with the ground, in every substep."""
-    return ContactSensorCfg(
-        name="ee_ground_collision",
-        primary=ContactMatch(mode="subtree", pattern=_NO_BODY, entity="robot"),
-        secondary=ContactMatch(mode="body", pattern="terrain"),
-        fields=("found", "force"),
-        reduce="maxforce",
-        num_slots=1,
-        history_length=4,
     )
 
 
@@ -121,14 +122,6 @@ def _observations() -> dict[str, ObservationGroupCfg | None]:
     return {
         "actor": ObservationGroupCfg(terms=terms, enable_corruption=True),
         "critic": ObservationGroupCfg(terms=copy.deepcopy(terms)),
-    }
-
-
-def _actions() -> dict[str, ActionTermCfg | None]:
-    return {
-        "joint_pos": mdp.JointPositionActionCfg(
-            entity_name="robot", actuator_names=(".*",), scale=0.5, use_default_offset=True
-        )
     }
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.managers import (
-    ActionTermCfg,
     CommandTermCfg,
     EventTermCfg,
     ObservationGroupCfg,
@@ -57,7 +56,11 @@ def make_tracking_env_cfg() -> ManagerBasedRlEnvCfg:
         episode_length_s=10.0,
         scene=SceneCfg(terrain=TerrainEntityCfg(terrain_type="plane"), num_envs=1),
         observations=_observations(),
-        actions=_actions(),
+        actions={
+            "joint_pos": mdp.JointPositionActionCfg(
+                entity_name="robot", actuator_names=(".*",), scale=0.5, use_default_offset=True
+            )
+        },
         commands=_commands(),
         events=_events(),
         rewards=_rewards(),
@@ -128,14 +131,6 @@ def _observations() -> dict[str, ObservationGroupCfg | None]:
     return {
         "actor": ObservationGroupCfg(terms=actor, enable_corruption=True),
         "critic": ObservationGroupCfg(terms=critic),
-    }
-
-
-def _actions() -> dict[str, ActionTermCfg | None]:
-    return {
-        "joint_pos": mdp.JointPositionActionCfg(
-            entity_name="robot", actuator_names=(".*",), scale=0.5, use_default_offset=True
-        )
     }
 
 

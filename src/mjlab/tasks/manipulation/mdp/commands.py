@@ -1,4 +1,4 @@
-"""The commands of the manipulation tasks."""
+"""The commands of the manipulation tasks: goals for one object, or for one of several."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.term_checks import check_range
 from mjlab.tasks.manipulation.mdp.goal_panel import GoalPanel
+from mjlab.utils.errors import check_one_of, check_positive
 from mjlab.utils.lab_api.math import sample_ranges
 
 if TYPE_CHECKING:
@@ -27,11 +28,20 @@ if TYPE_CHECKING:
     from mjlab.sim import Simulation
     from mjlab.viewer.debug_visualizer import Color, DebugVisualizer
 
-
 FIXED_GOAL = (0.4, 0.0, 0.3)
 """The goal of difficulty `fixed`, in metres from the environment's origin."""
 _GOAL_RADIUS = 0.03
 _GOAL_COLOR: Color = (1.0, 0.5, 0.0, 0.3)
+_DIFFICULTIES = ("fixed", "dynamic")
+logger = logging.getLogger(__name__)
+_MAX_TRIES = 200
+# Discs that are put down at random one after the other leave no room for another one once they
+# cover 55 % of the ground. Well below that there is room at the first few tries.
+_CROWDED = 0.35
+_NO_GEOM = -999
+_MARK_HEIGHT = 0.04
+_MARK_RADIUS = 0.01
+_MARK_COLOR: Color = (1.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(kw_only=True)
@@ -87,6 +97,10 @@ class GoalCommand(CommandTerm):
 
     def __init__(self, cfg: GoalCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
+        check_one_of("difficulty", cfg.difficulty, _DIFFICULTIES)
+        check_positive("success_threshold", cfg.success_threshold)
+        for axis in ("x", "y", "z"):
+            check_range(f"target_position_range.{axis}", getattr(cfg.target_position_range, axis))
         self.target_pos = torch.zeros(self.num_envs, 3, dtype=torch.float32, device=self.device)
         self.goal_age = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self.last_goal_met = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
@@ -109,7 +123,7 @@ class GoalCommand(CommandTerm):
 
     def wanted_object_pos(self) -> torch.Tensor:
         """Return where the object is that is to be brought, (N, 3), in the world (m)."""
-        raise NotImplementedError(f"{self.name} must define wanted_object_pos().")
+        raise NotImplementedError
 
     def compute_success(self) -> torch.Tensor:
         """Return where the object was at its goal at the end of the last step, (N,) bool."""
@@ -160,24 +174,20 @@ class GoalCommand(CommandTerm):
         metrics["goal_success"][env_ids] = 0.0
         self.goal_age[env_ids] = 0.0
         self._draw_command(env_ids)
-        self.target_pos[env_ids] = self._draw_goals(len(env_ids))
-        self.target_pos[env_ids] += self._env.scene.env_origins[env_ids]
+        if self.cfg.difficulty == "fixed":
+            goals = torch.tensor(FIXED_GOAL, dtype=torch.float32, device=self.device)
+        else:
+            within = self.cfg.target_position_range
+            goals = sample_ranges((within.x, within.y, within.z), len(env_ids), self.device)
+        self.target_pos[env_ids] = goals + self._env.scene.env_origins[env_ids]
         self._place_objects(env_ids)
 
     def _draw_command(self, env_ids: torch.Tensor) -> None:
         """Draw what comes before the goal; nothing unless overridden."""
 
-    def _draw_goals(self, count: int) -> torch.Tensor:
-        if self.cfg.difficulty == "fixed":
-            return torch.tensor(FIXED_GOAL, dtype=torch.float32, device=self.device).expand(
-                count, 3
-            )
-        within = self.cfg.target_position_range
-        return sample_ranges((within.x, within.y, within.z), count, self.device)
-
     def _place_objects(self, env_ids: torch.Tensor) -> None:
         """Put the objects of these environments to where they start, with `_place`."""
-        raise NotImplementedError(f"{self.name} must define _place_objects(env_ids).")
+        raise NotImplementedError
 
     def _place(
         self, entity: Entity, positions: torch.Tensor, yaws: torch.Tensor, env_ids: torch.Tensor
@@ -214,42 +224,6 @@ class GoalCommand(CommandTerm):
         for index in visualizer.get_env_indices(self.num_envs):
             goal = self.target_pos[index].cpu().numpy()
             visualizer.add_sphere(goal, _GOAL_RADIUS, self._goal_color)
-
-
-_DIFFICULTIES = ("fixed", "dynamic")
-
-
-def check_goal_cfg(cfg: GoalCommandCfg) -> None:
-    """Raise `ValueError` for a difficulty, a threshold or a range that make no sense."""
-    if cfg.difficulty not in _DIFFICULTIES:
-        raise ValueError(f"difficulty is {cfg.difficulty!r}; it has to be one of {_DIFFICULTIES}.")
-    if not cfg.success_threshold > 0.0:
-        raise ValueError(
-            f"success_threshold is {cfg.success_threshold!r}; it is a distance in metres, and no "
-            "object is closer to its goal than 0."
-        )
-    for axis in ("x", "y", "z"):
-        check_range(f"target_position_range.{axis}", getattr(cfg.target_position_range, axis))
-
-
-def check_pose_range(within: Any) -> None:
-    """Raise `ValueError` for a range of poses that makes no sense."""
-    for name in ("x", "y", "z", "yaw"):
-        check_range(f"object_pose_range.{name}", getattr(within, name))
-
-
-def require_object(env: ManagerBasedRlEnv, name: str, label: str, is_moved: bool) -> Entity:
-    """Return an entity of the scene; raises `ValueError` if there is none, or it cannot move."""
-    entities = env.scene.entities
-    if name not in entities:
-        raise ValueError(f"{label} is {name!r}, but the scene's entities are {list(entities)}.")
-    entity: Entity = entities[name]
-    if is_moved and entity.is_fixed_base:
-        raise ValueError(
-            f"{label} is {name!r}, which has a fixed base, so that it cannot be lifted. Give its "
-            "root body a free joint."
-        )
-    return entity
 
 
 @dataclass(kw_only=True)
@@ -298,7 +272,6 @@ class LiftingCommand(GoalCommand):
 
     def __init__(self, cfg: LiftingCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
-        check_goal_cfg(cfg)
         moved = cfg.object_pose_range is not None
         self.object: Entity = require_object(env, cfg.entity_name, "entity_name", moved)
         if cfg.object_pose_range is not None:
@@ -329,12 +302,125 @@ class LiftingCommand(GoalCommand):
         return self.cfg.viz.target_color
 
 
-logger = logging.getLogger(__name__)
-_MAX_TRIES = 200
+@dataclass(kw_only=True)
+class MultiCubeLiftingCommandCfg(GoalCommandCfg):
+    """A goal for one of several objects, all of which are put elsewhere with every new goal."""
 
-# Discs that are put down at random one after the other leave no room for another one once they
-# cover 55 % of the ground. Well below that there is room at the first few tries.
-_CROWDED = 0.35
+    @dataclass
+    class ObjectPoseRangeCfg:
+        """Where the objects are put, from the environment's origin."""
+
+        x: tuple[float, float] = (0.25, 0.40)
+        """Forward, in metres."""
+        y: tuple[float, float] = (-0.15, 0.15)
+        """To the left, in metres."""
+        z: tuple[float, float] = (0.02, 0.05)
+        """Up, in metres. The objects fall from there."""
+        yaw: tuple[float, float] = (-math.pi, math.pi)
+        """Turn about the vertical, in rad."""
+
+    entity_names: tuple[str, ...] = ()
+    """The objects, each with a free joint."""
+    object_pose_range: ObjectPoseRangeCfg = field(default_factory=ObjectPoseRangeCfg)
+    """Where the objects are put."""
+
+    def build(self, env: ManagerBasedRlEnv) -> MultiCubeLiftingCommand:
+        """Return the term; raises `ValueError` for ranges or objects that make no sense."""
+        return MultiCubeLiftingCommand(self, env)
+
+
+class MultiCubeLiftingCommand(GoalCommand):
+    """A goal (x, y, z) in the world for one object out of several; see `GoalCommand`.
+
+    Objects are put so far apart that they do not touch, whatever their yaw.
+
+    Attributes:
+        target_selection: (N,) int64, the wanted object: an index into `entity_names`.
+    """
+
+    _transient = {"_geom_ids", "_apart"}
+
+    cfg: MultiCubeLiftingCommandCfg
+
+    def __init__(self, cfg: MultiCubeLiftingCommandCfg, env: ManagerBasedRlEnv) -> None:
+        super().__init__(cfg, env)
+        check_pose_range(cfg.object_pose_range)
+        if not cfg.entity_names:
+            raise ValueError("entity_names is empty; name the objects, of which one is wanted.")
+        self.objects: list[Entity] = [
+            require_object(env, name, "A name in entity_names", is_moved=True)
+            for name in cfg.entity_names
+        ]
+        self.target_selection = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+        ids = [torch.as_tensor(one.indexing.geom_ids).long().cpu() for one in self.objects]
+        # (K, G) scene ids of each object's geoms.
+        self._geom_ids = torch.nn.utils.rnn.pad_sequence(
+            ids, batch_first=True, padding_value=_NO_GEOM
+        ).to(self.device)
+        self._apart = distance_apart(
+            env.sim, self._geom_ids, cfg.object_pose_range, cfg.entity_names
+        )
+
+    @property
+    def target_geom_ids(self) -> torch.Tensor:
+        """Scene ids of the wanted object's geoms, (N, G) int64, filled up with -999."""
+        return self._geom_ids[self.target_selection]
+
+    def wanted_object_pos(self) -> torch.Tensor:
+        return self.target_object_pos()
+
+    def target_object_pos(self) -> torch.Tensor:
+        """Return where the wanted object is now, (N, 3), in the world (m)."""
+        positions = torch.stack([entity.data.root_link_pos_w for entity in self.objects])
+        wanted = self.target_selection.view(1, -1, 1).expand(1, -1, 3)
+        return positions.gather(0, wanted).squeeze(0)
+
+    def _draw_command(self, env_ids: torch.Tensor) -> None:
+        self.target_selection[env_ids] = torch.randint(
+            len(self.objects), (len(env_ids),), device=self.device
+        )
+
+    def _place_objects(self, env_ids: torch.Tensor) -> None:
+        within = self.cfg.object_pose_range
+        count = len(env_ids)
+        positions, yaws = [], []
+        for _ in self.objects:
+            positions.append(sample_ranges((within.x, within.y, within.z), count, self.device))
+            yaws.append(sample_ranges((within.yaw,), count, self.device).squeeze(1))
+        placed = torch.stack(positions, dim=1)
+        keep_apart(placed, self._apart[env_ids], within.x, within.y)
+        for index, entity in enumerate(self.objects):
+            self._place(entity, placed[:, index], yaws[index], env_ids)
+
+    def _debug_vis_impl(self, visualizer: DebugVisualizer) -> None:
+        super()._debug_vis_impl(visualizer)
+        wanted = self.target_object_pos()
+        for index in visualizer.get_env_indices(self.num_envs):
+            mark = wanted[index].cpu().numpy() + (0.0, 0.0, _MARK_HEIGHT)
+            visualizer.add_sphere(mark, _MARK_RADIUS, _MARK_COLOR)
+
+
+def check_pose_range(within: Any) -> None:
+    """Raise `ValueError` for a range of poses that makes no sense."""
+    for name in ("x", "y", "z", "yaw"):
+        check_range(f"object_pose_range.{name}", getattr(within, name))
+
+
+def require_object(env: ManagerBasedRlEnv, name: str, label: str, is_moved: bool) -> Entity:
+    """Return an entity of the scene; raises `ValueError` if there is none, or it cannot move."""
+    entities = env.scene.entities
+    if name not in entities:
+        raise ValueError(f"{label} is {name!r}, but the scene's entities are {list(entities)}.")
+    entity: Entity = entities[name]
+    if is_moved and entity.is_fixed_base:
+        raise ValueError(
+            f"{label} is {name!r}, which has a fixed base, so that it cannot be lifted. Give its "
+            "root body a free joint."
+        )
+    return entity
+
+
+# Placing several objects so that none is in another.
 
 
 def keep_apart(
@@ -396,129 +482,56 @@ def distance_apart(
     radii = reach.new_zeros(len(reach), len(geom_ids))
     for ids in geom_ids.T:
         radii = torch.maximum(radii, torch.where(ids >= 0, reach[:, ids.clamp(min=0)], 0.0))
-    largest = int(radii.square().sum(dim=1).argmax())
-    _warn_if_crowded(radii[largest].tolist(), within, names)
-    return radii.unsqueeze(1) + radii.unsqueeze(2)
-
-
-def _warn_if_crowded(radii: list[float], within: Any, names: Sequence[str]) -> None:
-    widest = 2.0 * max(radii)
-    sides = [high - low + widest for low, high in (within.x, within.y)]
-    covered = sum(math.pi * radius**2 for radius in radii)
-    if len(radii) > 1 and covered > _CROWDED * sides[0] * sides[1]:
+    largest = radii[int(radii.square().sum(dim=1).argmax())].tolist()
+    sides = [high - low + 2.0 * max(largest) for low, high in (within.x, within.y)]
+    covered = sum(math.pi * radius**2 for radius in largest)
+    if len(largest) > 1 and covered > _CROWDED * sides[0] * sides[1]:
         logger.warning(
             "object_pose_range is small for the %d objects %s: some may be put into one another, "
             "and are then thrown apart. Widen x or y, or take fewer or smaller objects.",
-            len(radii),
+            len(largest),
             list(names),
         )
+    return radii.unsqueeze(1) + radii.unsqueeze(2)
 
 
-_NO_GEOM = -999
-_MARK_HEIGHT = 0.04
-_MARK_RADIUS = 0.01
-_MARK_COLOR: Color = (1.0, 0.0, 0.0, 1.0)
+# How far an arm reaches.
 
 
-@dataclass(kw_only=True)
-class MultiCubeLiftingCommandCfg(GoalCommandCfg):
-    """A goal for one of several objects, all of which are put elsewhere with every new goal."""
+def check_reach(
+    env: ManagerBasedRlEnv, command_name: str, cfg: GoalCommandCfg, entity_name: str, site: str
+) -> None:
+    """Raise `ValueError` if goals or objects of a command are certainly out of an arm's reach.
 
-    @dataclass
-    class ObjectPoseRangeCfg:
-        """Where the objects are put, from the environment's origin."""
-
-        x: tuple[float, float] = (0.25, 0.40)
-        """Forward, in metres."""
-        y: tuple[float, float] = (-0.15, 0.15)
-        """To the left, in metres."""
-        z: tuple[float, float] = (0.02, 0.05)
-        """Up, in metres. The objects fall from there."""
-        yaw: tuple[float, float] = (-math.pi, math.pi)
-        """Turn about the vertical, in rad."""
-
-    entity_names: tuple[str, ...] = ()
-    """The objects, each with a free joint."""
-    object_pose_range: ObjectPoseRangeCfg = field(default_factory=ObjectPoseRangeCfg)
-    """Where the objects are put."""
-
-    def build(self, env: ManagerBasedRlEnv) -> MultiCubeLiftingCommand:
-        """Return the term; raises `ValueError` for ranges or objects that make no sense."""
-        return MultiCubeLiftingCommand(self, env)
-
-
-class MultiCubeLiftingCommand(GoalCommand):
-    """A goal (x, y, z) in the world for one object out of several; see `GoalCommand`.
-
-    Objects are put so far apart that they do not touch, whatever their yaw.
-
-    Attributes:
-        target_selection: (N,) int64, the wanted object: an index into `entity_names`.
+    An object is at its goal within `success_threshold` of it, which is added to the reach.
     """
-
-    _transient = {"_geom_ids", "_apart"}
-
-    cfg: MultiCubeLiftingCommandCfg
-
-    def __init__(self, cfg: MultiCubeLiftingCommandCfg, env: ManagerBasedRlEnv) -> None:
-        super().__init__(cfg, env)
-        check_goal_cfg(cfg)
-        check_pose_range(cfg.object_pose_range)
-        if not cfg.entity_names:
-            raise ValueError("entity_names is empty; name the objects, of which one is wanted.")
-        self.objects: list[Entity] = [
-            require_object(env, name, "A name in entity_names", is_moved=True)
-            for name in cfg.entity_names
-        ]
-        self.target_selection = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
-        self._geom_ids = _padded_geom_ids(self.objects).to(self.device)
-        self._apart = distance_apart(
-            env.sim, self._geom_ids, cfg.object_pose_range, cfg.entity_names
-        )
-
-    @property
-    def target_geom_ids(self) -> torch.Tensor:
-        """Scene ids of the wanted object's geoms, (N, G) int64, filled up with -999."""
-        return self._geom_ids[self.target_selection]
-
-    def wanted_object_pos(self) -> torch.Tensor:
-        return self.target_object_pos()
-
-    def target_object_pos(self) -> torch.Tensor:
-        """Return where the wanted object is now, (N, 3), in the world (m)."""
-        positions = torch.stack([entity.data.root_link_pos_w for entity in self.objects])
-        wanted = self.target_selection.view(1, -1, 1).expand(1, -1, 3)
-        return positions.gather(0, wanted).squeeze(0)
-
-    def _draw_command(self, env_ids: torch.Tensor) -> None:
-        self.target_selection[env_ids] = torch.randint(
-            len(self.objects), (len(env_ids),), device=self.device
-        )
-
-    def _place_objects(self, env_ids: torch.Tensor) -> None:
-        within = self.cfg.object_pose_range
-        count = len(env_ids)
-        positions, yaws = [], []
-        for _ in self.objects:
-            positions.append(sample_ranges((within.x, within.y, within.z), count, self.device))
-            yaws.append(sample_ranges((within.yaw,), count, self.device).squeeze(1))
-        placed = torch.stack(positions, dim=1)
-        keep_apart(placed, self._apart[env_ids], within.x, within.y)
-        for index, entity in enumerate(self.objects):
-            self._place(entity, placed[:, index], yaws[index], env_ids)
-
-    def _debug_vis_impl(self, visualizer: DebugVisualizer) -> None:
-        super()._debug_vis_impl(visualizer)
-        wanted = self.target_object_pos()
-        for index in visualizer.get_env_indices(self.num_envs):
-            mark = wanted[index].cpu().numpy() + (0.0, 0.0, _MARK_HEIGHT)
-            visualizer.add_sphere(mark, _MARK_RADIUS, _MARK_COLOR)
+    found = reach(env.sim.mj_model, f"{entity_name}/{site}")
+    if found is None:
+        return
+    center, longest = found
+    goals, starts = cfg.target_position_range, getattr(cfg, "object_pose_range", None)
+    narrow = "Narrow {} to what the arm can reach."
+    places: list[tuple[str, list[tuple[float, ...]], str]]
+    places = [("goals", _corners(goals), narrow.format("target_position_range"))]
+    if cfg.difficulty == "fixed":
+        nearer = "Put the arm nearer, or choose the difficulty 'dynamic', whose goals have a range."
+        places = [("goals", [FIXED_GOAL], nearer)]
+    if starts is not None:
+        places.append(("objects", _corners(starts), narrow.format("object_pose_range")))
+    for label, points, remedy in places:
+        farthest = max(points, key=lambda point: math.dist(point, center))
+        distance = math.dist(farthest, center)
+        if distance > longest + cfg.success_threshold:
+            raise ValueError(
+                f"The command {command_name!r} puts {label} as far away as {farthest} (metres from "
+                f"the environment's origin). That is {distance:.2f} m from the first joint of entity "
+                f"{entity_name!r}, whose site {site!r} gets {longest:.2f} m from it at most. "
+                f"{remedy}"
+            )
 
 
-def _padded_geom_ids(objects: list[Entity]) -> torch.Tensor:
-    """Return the scene ids of each object's geoms, (objects, G) int64."""
-    ids = [torch.as_tensor(entity.indexing.geom_ids).long().cpu() for entity in objects]
-    return torch.nn.utils.rnn.pad_sequence(ids, batch_first=True, padding_value=_NO_GEOM)
+def _corners(within: Any) -> list[tuple[float, ...]]:
+    return list(itertools.product(within.x, within.y, within.z))
 
 
 def reach(model: mujoco.MjModel, site: str) -> tuple[np.ndarray, float] | None:
@@ -553,51 +566,6 @@ def reach(model: mujoco.MjModel, site: str) -> tuple[np.ndarray, float] | None:
             point, is_jointed = anchor, True
         body = int(model.body_parentid[body])
     return (point, length) if is_jointed or length > 0.0 else (point, 0.0)
-
-
-def check_reach(
-    env: ManagerBasedRlEnv, command_name: str, cfg: GoalCommandCfg, entity_name: str, site: str
-) -> None:
-    """Raise `ValueError` if goals or objects of a command are certainly out of an arm's reach.
-
-    An object is at its goal within `success_threshold` of it, which is added to the reach.
-    """
-    found = reach(env.sim.mj_model, f"{entity_name}/{site}")
-    if found is None:
-        return
-    center, longest = found
-    starts = getattr(cfg, "object_pose_range", None)
-    for label, points in (
-        ("goals", _goals(cfg)),
-        ("objects", [] if starts is None else _corners(starts)),
-    ):
-        if not points:
-            continue
-        farthest = max(points, key=lambda point: math.dist(point, center))
-        distance = math.dist(farthest, center)
-        if distance > longest + cfg.success_threshold:
-            remedy = _remedy(cfg, label)
-            raise ValueError(
-                f"The command {command_name!r} puts {label} as far away as {farthest} (metres from "
-                f"the environment's origin). That is {distance:.2f} m from the first joint of entity "
-                f"{entity_name!r}, whose site {site!r} gets {longest:.2f} m from it at most. "
-                f"{remedy}"
-            )
-
-
-def _remedy(cfg: GoalCommandCfg, label: str) -> str:
-    if label == "goals" and cfg.difficulty == "fixed":
-        return "Put the arm nearer, or choose the difficulty 'dynamic', whose goals have a range."
-    field = "target_position_range" if label == "goals" else "object_pose_range"
-    return f"Narrow {field} to what the arm can reach."
-
-
-def _goals(cfg: GoalCommandCfg) -> list[tuple[float, ...]]:
-    return [FIXED_GOAL] if cfg.difficulty == "fixed" else _corners(cfg.target_position_range)
-
-
-def _corners(within: Any) -> list[tuple[float, ...]]:
-    return list(itertools.product(within.x, within.y, within.z))
 
 
 __getattr__ = older_names(__name__)

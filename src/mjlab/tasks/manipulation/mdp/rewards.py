@@ -6,6 +6,7 @@ substep, of hand and object alike.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -14,6 +15,7 @@ from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.term_checks import checked_when_built
 from mjlab.tasks.manipulation.mdp.observations import (
+    DEFAULT_ASSET_CFG,
     check_multi,
     check_multi_with_hand,
     check_single,
@@ -22,13 +24,12 @@ from mjlab.tasks.manipulation.mdp.observations import (
     multi_cube_command,
     site_pos,
 )
+from mjlab.utils.errors import check_in_range
 from mjlab.utils.indexing import as_columns
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
-
-_DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 
 
 @checked_when_built(check_single_with_hand)
@@ -38,7 +39,7 @@ def staged_position_reward(
     object_name: str,
     reaching_std: float,
     bringing_std: float,
-    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+    asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG,
 ) -> torch.Tensor:
     """Reward reaching the object, and then bringing it to its goal.
 
@@ -67,7 +68,7 @@ def multi_cube_staged_position_reward(
     command_name: str,
     reaching_std: float,
     bringing_std: float,
-    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+    asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG,
 ) -> torch.Tensor:
     """Reward reaching the wanted object and bringing it to its goal; see `staged_position_reward`."""
     command = multi_cube_command(env, command_name)
@@ -86,13 +87,12 @@ def multi_cube_bring_object_reward(
 
 
 def _check_max_vel(env: ManagerBasedRlEnv, max_vel: float, **_: Any) -> None:
-    if not max_vel >= 0.0:
-        raise ValueError(f"max_vel is {max_vel!r}; it is a speed, at least 0.")
+    check_in_range("max_vel", max_vel, 0.0, math.inf)
 
 
 @checked_when_built(_check_max_vel)
 def joint_velocity_hinge_penalty(
-    env: ManagerBasedRlEnv, max_vel: float, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
+    env: ManagerBasedRlEnv, max_vel: float, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
     """Penalize joints faster than `max_vel`: the sum of `max(|v| - max_vel, 0)^2`.
 

@@ -22,6 +22,7 @@ from mjlab.managers import (
 from mjlab.sensor import CameraSensorCfg, ContactSensorCfg
 from mjlab.tasks.manipulation import mdp
 from mjlab.tasks.manipulation.lift_cube_env_cfg import make_lift_cube_env_cfg
+from mjlab.utils.errors import check_count, check_one_of
 
 _HAND = ("grasp_site",)
 _FINGERTIPS = "[lr]f_down(6|7|8|9|10|11)_collision"
@@ -106,13 +107,22 @@ def yam_lift_cube_vision_env_cfg(
     Raises:
         ValueError: `cam_type` is neither `rgb` nor `depth`.
     """
-    if cam_type not in ("rgb", "depth"):
-        raise ValueError(f"cam_type is {cam_type!r}; it has to be 'rgb' or 'depth'.")
+    check_one_of("cam_type", cam_type, ("rgb", "depth"))
     cfg = yam_lift_cube_env_cfg(play=play)
     cfg.scene.sensors += (_camera((cam_type,)),)
     if cam_type == "rgb":
         image = ObservationTermCfg(func=mdp.camera_rgb, params={"sensor_name": _CAMERA})
-        cfg.events["cube_color"] = _any_color()
+        cfg.events["cube_color"] = EventTermCfg(
+            func=mdp.dr.geom_rgba,
+            mode="reset",
+            params={
+                "asset_cfg": SceneEntityCfg("cube", geom_names=(".*",)),
+                "operation": "abs",
+                "distribution": "uniform",
+                "axes": [0, 1, 2],
+                "ranges": (0.0, 1.0),
+            },
+        )
     else:
         image = _depth_image()
     cfg.observations["camera"] = ObservationGroupCfg(
@@ -140,8 +150,7 @@ def yam_multi_cube_seg_env_cfg(num_cubes: int = 3, play: bool = False) -> Manage
     Raises:
         ValueError: `num_cubes` is below 1.
     """
-    if num_cubes < 1:
-        raise ValueError(f"num_cubes is {num_cubes}; there has to be at least 1 to lift.")
+    check_count("num_cubes", num_cubes)
     cfg = yam_lift_cube_env_cfg(play=play)
     del cfg.scene.entities["cube"]
     cubes = tuple(f"cube_{index}" for index in range(num_cubes))
@@ -215,20 +224,6 @@ def _depth_image() -> ObservationTermCfg:
     return ObservationTermCfg(
         func=mdp.camera_depth,
         params={"sensor_name": _CAMERA, "cutoff_distance": _DEPTH_CUTOFF},
-    )
-
-
-def _any_color() -> EventTermCfg:
-    return EventTermCfg(
-        func=mdp.dr.geom_rgba,
-        mode="reset",
-        params={
-            "asset_cfg": SceneEntityCfg("cube", geom_names=(".*",)),
-            "operation": "abs",
-            "distribution": "uniform",
-            "axes": [0, 1, 2],
-            "ranges": (0.0, 1.0),
-        },
     )
 
 
