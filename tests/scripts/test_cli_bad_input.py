@@ -97,7 +97,7 @@ def test_an_unknown_task_is_answered_with_the_nearest_names(run, script):
     outcome = run(script, "Mjlab-Cartpole-Swing", "--num-envs", "4")
     assert outcome.status == 1
     assert "'Mjlab-Cartpole-Swing'" in outcome.message
-    assert "Did you mean Mjlab-Cartpole-Swingup" in outcome.message
+    assert "did you mean 'Mjlab-Cartpole-Swingup'" in outcome.message
     assert "list-envs" in outcome.message
 
 
@@ -404,4 +404,4 @@ def test_the_exit_status_reaches_the_shell():
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert done.stdout == ""
-    assert done.stderr.startswith("error: Unknown task 'Mjlab-Cartpole-Swing'. Did you mean")
+    assert done.stderr.startswith("error: Unknown task 'Mjlab-Cartpole-Swing'; did you mean")

@@ -199,7 +199,7 @@ def test_a_task_without_a_learner_is_refused():
 
 @pytest.mark.parametrize("load", [load_env_cfg, load_rl_cfg, load_runner_cls, require_task])
 def test_an_unknown_task_is_a_key_error_with_the_nearest_names(load):
-    with pytest.raises(UnknownTaskError, match="Did you mean Mjlab-Cartpole-Balance") as caught:
+    with pytest.raises(UnknownTaskError, match="did you mean 'Mjlab-Cartpole-Balance'") as caught:
         load("Mjlab-Cartpole-Balanse")
     assert isinstance(caught.value, KeyError)
     assert str(len(list_tasks())) in str(caught.value)

@@ -251,9 +251,9 @@ def test_a_sphere_marks_the_goal_of_the_environment_in_view():
     ("fields", "message"),
     [
         ({"entity_name": "cub"}, r"entity_name is 'cub', .* \['cube'\]"),
-        ({"difficulty": "hard"}, "difficulty is 'hard'; .*'fixed', 'dynamic'"),
-        ({"success_threshold": 0.0}, "success_threshold is 0.0"),
-        ({"success_threshold": math.nan}, "success_threshold is nan"),
+        ({"difficulty": "hard"}, "difficulty.*'fixed', 'dynamic'.*'hard'"),
+        ({"success_threshold": 0.0}, "success_threshold.* 0.0"),
+        ({"success_threshold": math.nan}, "success_threshold.* nan"),
         (
             {"target_position_range": Range(x=(0.5, 0.3))},
             r"target_position_range.x.*\(0.5, 0.3\)",

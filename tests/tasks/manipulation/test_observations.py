@@ -195,19 +195,6 @@ def test_the_mask_is_of_the_wanted_cubes_geoms_and_of_nothing_else():
 
 
 @pytest.mark.parametrize(
-    ("term", "arguments", "missing"),
-    [
-        (mdp.camera_rgb, (), "rgb"),
-        (mdp.camera_depth, (0.5,), "depth"),
-        (mdp.camera_segmentation, (), "segmentation"),
-    ],
-)
-def test_an_image_that_the_camera_does_not_give_is_named(term, arguments, missing):
-    with pytest.raises(ValueError, match=f"'camera' gives no {missing}; add '{missing}'"):
-        term(camera(), "camera", *arguments)
-
-
-@pytest.mark.parametrize(
     ("params", "error", "message"),
     [
         ({"sensor_name": "camera"}, ValueError, "sensor 'camera'.*did you mean 'camera_d405'"),
@@ -223,19 +210,25 @@ def test_a_wrong_camera_is_refused_when_the_environment_is_built(make_env, param
         make_env(DEPTH, edit=edit)
 
 
-def test_a_camera_without_the_data_type_is_refused_when_the_environment_is_built(make_env):
+@pytest.mark.parametrize(
+    ("func", "missing"),
+    [(mdp.camera_rgb, "rgb"), (mdp.camera_segmentation, "segmentation")],
+)
+def test_a_camera_without_the_data_type_is_refused_when_the_environment_is_built(
+    make_env, func, missing
+):
     def edit(cfg):
         term = cfg.observations["camera"].terms["camera_d405_depth"]
-        term.func = mdp.camera_rgb
+        term.func = func
         del term.params["cutoff_distance"]
 
-    with pytest.raises(ValueError, match=r"'camera_d405' has data_types=\('depth',\).*'rgb'"):
+    with pytest.raises(ValueError, match=rf"'camera_d405' has.*\('depth',\).*'{missing}'"):
         make_env(DEPTH, edit=edit)
 
 
 def test_hand_object_and_command_are_checked_when_the_environment_is_built(make_env):
     for term, params, error, message in (
-        ("ee_to_cube", {"object_name": "cub"}, ValueError, "object_name is 'cub'.*'cube'"),
+        ("ee_to_cube", {"object_name": "cub"}, ValueError, "object_name.*'cub'.*'cube'"),
         ("ee_to_cube", {"asset_cfg": SceneEntityCfg("robot")}, ValueError, "selects 2 sites"),
         ("cube_to_goal", {"command_name": "lift"}, ValueError, "command 'lift'"),
     ):

@@ -106,17 +106,17 @@ def test_joints_cost_what_is_above_their_speed():
 @pytest.mark.parametrize(
     ("term", "params", "error", "message"),
     [
-        ("lift", {"reaching_std": 0.0}, ValueError, "reaching_std is 0.0"),
-        ("lift", {"bringing_std": -1.0}, ValueError, "bringing_std is -1.0"),
-        ("lift_precise", {"std": 0.0}, ValueError, "std is 0.0"),
+        ("lift", {"reaching_std": 0.0}, ValueError, "reaching_std.* 0.0"),
+        ("lift", {"bringing_std": -1.0}, ValueError, "bringing_std.* -1.0"),
+        ("lift_precise", {"std": 0.0}, ValueError, "std.* 0.0"),
         (
             "lift",
             {"object_name": "cuube"},
             ValueError,
-            "object_name is 'cuube'.*Did you mean 'cube'",
+            "object_name.*'cuube'.*did you mean 'cube'",
         ),
-        ("joint_vel_hinge", {"max_vel": -0.5}, ValueError, "max_vel is -0.5"),
-        ("lift", {"command_name": "lift"}, ValueError, "no command 'lift'"),
+        ("joint_vel_hinge", {"max_vel": -0.5}, ValueError, "max_vel.* -0.5"),
+        ("lift", {"command_name": "lift"}, ValueError, "command 'lift'"),
         ("lift", {"asset_cfg": SceneEntityCfg("robot")}, ValueError, "selects 2 sites.*grasp_site"),
         ("lift", {"asset_cfg": SceneEntityCfg("cube")}, ValueError, "selects 0 sites"),
     ],
@@ -159,7 +159,7 @@ def test_a_force_that_no_contact_can_have_is_refused(make_env, threshold):
     def edit(cfg):
         cfg.terminations["ee_ground_collision"].params["force_threshold"] = threshold
 
-    with pytest.raises(ValueError, match="'ee_ground_collision': force_threshold is (-10.0|nan)"):
+    with pytest.raises(ValueError, match="'ee_ground_collision': force_threshold.* (-10.0|nan)"):
         make_env(edit=edit)
 
 

@@ -92,7 +92,7 @@ def test_a_motion_file_wins_over_everything(tmp_path):
     record_motions([SQUAT], tmp_path)
     origin = PolicyOrigin(G1, tmp_path / "model_0.pt")
     assert prepared(MotionOptions(motion_file="slow_walk"), origin, changed="wave") == [WALK]
-    with pytest.raises(MotionFileError, match="There is no motion file 'walk.npz'"):
+    with pytest.raises(MotionFileError, match="motion 'walk.npz'"):
         prepared(MotionOptions(motion_file="walk.npz"))
 
 

@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from mjlab.utils.errors import MjlabError
 from mjlab.utils.os import replacing
 
 _ARRAYS: dict[str, int | None] = {
@@ -42,7 +43,7 @@ _QUAT_TOLERANCE = 1e-3
 _RATE_TOLERANCE = 1e-3
 
 
-class MotionFileError(ValueError):
+class MotionFileError(MjlabError, ValueError):
     """Raised for a file that is no motion, or none of this robot; the text says why."""
 
 
@@ -94,23 +95,59 @@ def read_motion(path: str | Path) -> Motion:
     arrays = {key: _checked_array(path, key, content[key], size) for key, size in _ARRAYS.items()}
     _check_sizes(path, arrays)
     arrays["body_quat_w"] = _unit_quaternions(path, arrays["body_quat_w"])
-    names = {key: _names(path, key, content.get(key)) for key in ("joint_names", "body_names")}
-    for key, like in (("joint_names", "joint_pos"), ("body_names", "body_pos_w")):
-        if names[key] and len(names[key]) != arrays[like].shape[1]:
-            raise MotionFileError(
-                f"The motion {path} has {len(names[key])} {key}, and {arrays[like].shape[1]} "
-                f"columns in {like}."
-            )
+    names = {
+        key: _names(path, key, content.get(key), like, arrays[like].shape[1])
+        for key, like in (("joint_names", "joint_pos"), ("body_names", "body_pos_w"))
+    }
     values: dict[str, Any] = {
         key: np.ascontiguousarray(value, dtype=np.float32) for key, value in arrays.items()
     }
     return Motion(fps=_fps(path, content.get("fps")), **values, **names)
 
 
-def npz_path(path: str | Path) -> Path:
-    """Return where a motion of that name goes: `.npz` is added where it is missing."""
-    path = Path(path)
-    return path if path.suffix == ".npz" else path.with_name(f"{path.name}.npz")
+def check_motion_fits(
+    path: str | Path,
+    motion: Motion,
+    joint_names: Sequence[str],
+    body_names: Sequence[str],
+    step_dt: float,
+) -> None:
+    """Refuse a motion that is not of this robot or plays at another speed.
+
+    Args:
+        path: Where it was read from, for messages.
+        motion: The motion.
+        joint_names: Joints of the robot, in order.
+        body_names: Bodies of the robot, in order.
+        step_dt: The control period, in seconds.
+
+    Raises:
+        MotionFileError: another number of joints or bodies, or, where the file names them, others
+            or in another order; a frame rate that is not that of control.
+    """
+    for what, wanted, names, columns in (
+        ("joints", joint_names, motion.joint_names, motion.joint_pos),
+        ("bodies", body_names, motion.body_names, motion.body_pos_w),
+    ):
+        if columns.shape[1] != len(wanted):
+            raise MotionFileError(
+                f"The motion {path} has {columns.shape[1]} {what}, and the robot {len(wanted)}: "
+                f"{list(wanted)}."
+            )
+        if names and tuple(names) != tuple(wanted):
+            pairs = zip(names, wanted, strict=True)
+            first = next(i for i, (name, other) in enumerate(pairs) if name != other)
+            raise MotionFileError(
+                f"The {what} of the motion {path} are not those of the robot in its order: number "
+                f"{first} is {names[first]!r} in the motion and {wanted[first]!r} in the robot."
+            )
+    if motion.fps is not None and abs(motion.fps * step_dt - 1.0) > _RATE_TOLERANCE:
+        raise MotionFileError(
+            f"The motion {path} has {motion.fps:g} frames per second, and the task is controlled "
+            f"{1.0 / step_dt:g} times per second (every {step_dt:g} s), so that it would play at "
+            "the wrong speed. Resample it: `mjlab csv-to-npz --input-file "
+            f"{path} --output-fps {1.0 / step_dt:g} --output-file ...`."
+        )
 
 
 def write_motion(path: str | Path, motion: Motion) -> Path:
@@ -145,50 +182,10 @@ def write_motion(path: str | Path, motion: Motion) -> Path:
     return path
 
 
-def check_motion_fits(
-    path: str | Path,
-    motion: Motion,
-    joint_names: Sequence[str],
-    body_names: Sequence[str],
-    step_dt: float,
-) -> None:
-    """Refuse a motion that is not of this robot or plays at another speed.
-
-    Args:
-        path: Where it was read from, for messages.
-        motion: The motion.
-        joint_names: Joints of the robot, in order.
-        body_names: Bodies of the robot, in order.
-        step_dt: The control period, in seconds.
-
-    Raises:
-        MotionFileError: another number of joints or bodies, or, where the file names them, others
-            or in another order; a frame rate that is not that of control.
-    """
-    for what, wanted, names, columns in (
-        ("joints", joint_names, motion.joint_names, motion.joint_pos),
-        ("bodies", body_names, motion.body_names, motion.body_pos_w),
-    ):
-        if columns.shape[1] != len(wanted):
-            raise MotionFileError(
-                f"The motion {path} has {columns.shape[1]} {what}, and the robot {len(wanted)}: "
-                f"{list(wanted)}."
-            )
-        if names and tuple(names) != tuple(wanted):
-            first = next(
-                i for i, pair in enumerate(zip(names, wanted, strict=True)) if _differ(pair)
-            )
-            raise MotionFileError(
-                f"The {what} of the motion {path} are not those of the robot in its order: number "
-                f"{first} is {names[first]!r} in the motion and {wanted[first]!r} in the robot."
-            )
-    if motion.fps is not None and abs(motion.fps * step_dt - 1.0) > _RATE_TOLERANCE:
-        raise MotionFileError(
-            f"The motion {path} has {motion.fps:g} frames per second, and the task is controlled "
-            f"{1.0 / step_dt:g} times per second (every {step_dt:g} s), so that it would play at "
-            "the wrong speed. Resample it: `mjlab csv-to-npz --input-file "
-            f"{path} --output-fps {1.0 / step_dt:g} --output-file ...`."
-        )
+def npz_path(path: str | Path) -> Path:
+    """Return where a motion of that name goes: `.npz` is added where it is missing."""
+    path = Path(path)
+    return path if path.suffix == ".npz" else path.with_name(f"{path.name}.npz")
 
 
 def motion_hash(path: str | Path) -> str:
@@ -196,13 +193,7 @@ def motion_hash(path: str | Path) -> str:
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
-def _differ(pair: tuple[str, str]) -> bool:
-    return pair[0] != pair[1]
-
-
 def _load(path: Path) -> dict[str, np.ndarray]:
-    if not path.is_file():
-        raise MotionFileError(f"There is no motion file {path}.")
     try:
         with np.load(path, allow_pickle=False) as archive:
             if not hasattr(archive, "files"):
@@ -214,6 +205,21 @@ def _load(path: Path) -> dict[str, np.ndarray]:
         # Whatever a damaged or hostile file makes zipfile and NumPy raise.
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise MotionFileError(f"{path} cannot be read as a motion (.npz): {reason}") from error
+
+
+def _names(
+    path: Path, key: str, value: np.ndarray | None, like: str, count: int
+) -> tuple[str, ...]:
+    """Return names of the columns of the array `like`, of which there are `count`, or none."""
+    if value is None:
+        return ()
+    if value.ndim != 1 or value.dtype.kind != "U":
+        raise MotionFileError(f"{key} of the motion {path} has to be a list of texts.")
+    if len(value) not in (0, count):
+        raise MotionFileError(
+            f"The motion {path} has {len(value)} {key}, and {count} columns in {like}."
+        )
+    return tuple(str(name) for name in value)
 
 
 def _checked_array(path: Path, key: str, value: np.ndarray, size: int | None) -> np.ndarray:
@@ -264,25 +270,14 @@ def _unit_quaternions(path: Path, quats: np.ndarray) -> np.ndarray:
     return quats / norms
 
 
-def _names(path: Path, key: str, value: np.ndarray | None) -> tuple[str, ...]:
-    if value is None:
-        return ()
-    if value.ndim != 1 or value.dtype.kind != "U":
-        raise MotionFileError(f"{key} of the motion {path} has to be a list of texts.")
-    return tuple(str(name) for name in value)
-
-
-def _is_rate(array: np.ndarray) -> bool:
-    with np.errstate(over="ignore", under="ignore"):
-        return 0.0 < float(np.float32(array.reshape(()))) < math.inf
-
-
 def _fps(path: Path, value: Any) -> float | None:
     if value is None:
         return None
     array = np.asarray(value)
-    if array.size != 1 or array.dtype.kind not in "fiu" or not _is_rate(array):
-        raise MotionFileError(
-            f"fps of the motion {path} is {value!r}; it has to be one rate above 0."
-        )
-    return float(array.reshape(()))
+    is_number = array.size == 1 and array.dtype.kind in "fiu"
+    with np.errstate(over="ignore", under="ignore"):
+        if not (is_number and 0.0 < float(np.float32(array.item())) < math.inf):
+            raise MotionFileError(
+                f"fps of the motion {path} is {value!r}; it has to be one rate above 0."
+            )
+    return float(array.item())

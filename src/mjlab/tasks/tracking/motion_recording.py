@@ -1,4 +1,8 @@
-"""TODO."""
+"""From joint angles to motions: recordings, their resampling, velocities and bodies; and as CSV.
+
+A CSV file is in the layout of the retargeted LAFAN1 sets: no header, comma separated, one pose a line:
+position of the root (m), its quaternion x y z w, and the angles of all joints (rad) in the order of the robot.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,9 @@ import mujoco
 import numpy as np
 
 from mjlab.tasks.tracking.motion_file import Motion, MotionFileError
+
+_ROOT_COLUMNS = 7
+_QUAT_TOLERANCE = 1e-2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -29,6 +36,106 @@ class Recording:
 
     def __len__(self) -> int:
         return len(self.root_pos)
+
+
+def make_motion(
+    recording: Recording,
+    model: mujoco.MjModel,
+    joint_names: tuple[str, ...] = (),
+    body_names: tuple[str, ...] = (),
+) -> Motion:
+    """Return the motion of a recording: velocities, and poses and velocities of all bodies.
+
+    Velocities of the root and of the joints are central differences, and those of the bodies follow
+    from them. At both ends linear and joint velocities are one-sided differences, and the angular
+    velocity of the root is that of the neighboring pose, as release 1.6 of the interface has them.
+
+    Args:
+        recording: At least two poses.
+        model: The robot alone, whose first joint is a free one.
+        joint_names: Names to write down with the motion.
+        body_names: Likewise.
+
+    Raises:
+        ValueError: fewer than two poses, another number of joints, or a robot without a free joint.
+    """
+    if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+        raise ValueError("The robot has no free joint, so that it cannot be put onto a motion.")
+    if recording.joint_pos.shape[1] != model.nq - 7:
+        raise ValueError(
+            f"The recording has {recording.joint_pos.shape[1]} joints, and the robot {model.nq - 7}."
+        )
+    dt = 1.0 / recording.fps
+    lin_vel = np.gradient(recording.root_pos, dt, axis=0)
+    ang_vel = angular_velocities(recording.root_quat, dt)
+    joint_vel = np.gradient(recording.joint_pos, dt, axis=0)
+    data = mujoco.MjData(model)
+    frames: list[tuple[np.ndarray, ...]] = []
+    for t in range(len(recording)):
+        data.qpos[:3], data.qpos[3:7] = recording.root_pos[t], recording.root_quat[t]
+        data.qpos[7:] = recording.joint_pos[t]
+        # The angular velocity of a free joint is in the frame of the body.
+        back = recording.root_quat[t] * (1.0, -1.0, -1.0, -1.0)
+        mujoco.mju_rotVecQuat(data.qvel[3:6], ang_vel[t], back)
+        data.qvel[:3], data.qvel[6:] = lin_vel[t], joint_vel[t]
+        frames.append(_bodies(model, data))
+    pos, quat, linear, angular = (np.stack(values) for values in zip(*frames, strict=True))
+    return Motion(
+        fps=recording.fps,
+        joint_pos=recording.joint_pos.astype(np.float32),
+        joint_vel=joint_vel.astype(np.float32),
+        body_pos_w=pos.astype(np.float32),
+        body_quat_w=quat.astype(np.float32),
+        body_lin_vel_w=linear.astype(np.float32),
+        body_ang_vel_w=angular.astype(np.float32),
+        joint_names=tuple(joint_names),
+        body_names=tuple(body_names),
+    )
+
+
+def _bodies(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, ...]:
+    """Return positions, orientations, linear and angular velocities of all bodies but the world."""
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_comVel(model, data)
+    pos, angular = data.xpos[1:].copy(), data.cvel[1:, :3].copy()
+    centre = data.subtree_com[model.body_rootid[1:]]
+    linear = data.cvel[1:, 3:] + np.cross(angular, pos - centre)
+    return pos, data.xquat[1:].copy(), linear, angular
+
+
+def recording_of(motion: Motion, fps: float) -> Recording:
+    """Return the poses of a motion; body 0 is the floating base."""
+    quat = motion.body_quat_w[:, 0].astype(np.float64)
+    return Recording(
+        fps=fps,
+        root_pos=motion.body_pos_w[:, 0].astype(np.float64),
+        root_quat=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
+        joint_pos=motion.joint_pos.astype(np.float64),
+    )
+
+
+def angular_velocities(quats: np.ndarray, dt: float) -> np.ndarray:
+    """Return the angular velocities (T, 3), in world axes, of orientations (T, 4) dt apart.
+
+    log(q_(t+1) q_(t-1)*) / (2 dt). The first and the last are those of their neighbors; of two
+    orientations, both are the one difference.
+    """
+    if len(quats) < 3:
+        return np.repeat(_rotation_vectors(quats[:-1], quats[1:]) / dt, len(quats), axis=0)
+    inner = _rotation_vectors(quats[:-2], quats[2:]) / (2.0 * dt)
+    return np.concatenate((inner[:1], inner, inner[-1:]))
+
+
+def _rotation_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return log(end start*), (n, 3)."""
+    result = np.empty((len(start), 3))
+    relative, back = np.empty(4), np.empty(4)
+    for i in range(len(start)):
+        mujoco.mju_negQuat(back, start[i])
+        mujoco.mju_mulQuat(relative, end[i], back)
+        mujoco.mju_quat2Vel(result[i], relative, 1.0)
+    return result
 
 
 def resampled(recording: Recording, fps: float) -> Recording:
@@ -91,115 +198,7 @@ def slerp(start: np.ndarray, end: np.ndarray, blend: np.ndarray) -> np.ndarray:
     return mixed / np.linalg.norm(mixed, axis=-1, keepdims=True)
 
 
-def make_motion(
-    recording: Recording,
-    model: mujoco.MjModel,
-    joint_names: tuple[str, ...] = (),
-    body_names: tuple[str, ...] = (),
-) -> Motion:
-    """Return the motion of a recording: velocities, and poses and velocities of all bodies.
-
-    Velocities of the root and of the joints are central differences, and those of the bodies follow
-    from them. At both ends linear and joint velocities are one-sided differences, and the angular
-    velocity of the root is that of the neighboring pose, as release 1.6 of the interface has them.
-
-    Args:
-        recording: At least two poses.
-        model: The robot alone, whose first joint is a free one.
-        joint_names: Names to write down with the motion.
-        body_names: Likewise.
-
-    Raises:
-        ValueError: fewer than two poses, another number of joints, or a robot without a free joint.
-    """
-    _check(recording, model)
-    dt = 1.0 / recording.fps
-    lin_vel = np.gradient(recording.root_pos, dt, axis=0)
-    ang_vel = angular_velocities(recording.root_quat, dt)
-    joint_vel = np.gradient(recording.joint_pos, dt, axis=0)
-    data = mujoco.MjData(model)
-    frames: list[tuple[np.ndarray, ...]] = []
-    for t in range(len(recording)):
-        data.qpos[:3], data.qpos[3:7] = recording.root_pos[t], recording.root_quat[t]
-        data.qpos[7:] = recording.joint_pos[t]
-        # The angular velocity of a free joint is in the frame of the body.
-        back = recording.root_quat[t] * (1.0, -1.0, -1.0, -1.0)
-        mujoco.mju_rotVecQuat(data.qvel[3:6], ang_vel[t], back)
-        data.qvel[:3], data.qvel[6:] = lin_vel[t], joint_vel[t]
-        frames.append(_bodies(model, data))
-    pos, quat, linear, angular = (np.stack(values) for values in zip(*frames, strict=True))
-    return Motion(
-        fps=recording.fps,
-        joint_pos=recording.joint_pos.astype(np.float32),
-        joint_vel=joint_vel.astype(np.float32),
-        body_pos_w=pos.astype(np.float32),
-        body_quat_w=quat.astype(np.float32),
-        body_lin_vel_w=linear.astype(np.float32),
-        body_ang_vel_w=angular.astype(np.float32),
-        joint_names=tuple(joint_names),
-        body_names=tuple(body_names),
-    )
-
-
-def recording_of(motion: Motion, fps: float) -> Recording:
-    """Return the poses of a motion; body 0 is the floating base."""
-    quat = motion.body_quat_w[:, 0].astype(np.float64)
-    return Recording(
-        fps=fps,
-        root_pos=motion.body_pos_w[:, 0].astype(np.float64),
-        root_quat=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
-        joint_pos=motion.joint_pos.astype(np.float64),
-    )
-
-
-def angular_velocities(quats: np.ndarray, dt: float) -> np.ndarray:
-    """Return the angular velocities (T, 3), in world axes, of orientations (T, 4) dt apart.
-
-    log(q_(t+1) q_(t-1)*) / (2 dt). The first and the last are those of their neighbors; of two
-    orientations, both are the one difference.
-    """
-    if len(quats) < 3:
-        return np.repeat(_rotation_vectors(quats[:-1], quats[1:]) / dt, len(quats), axis=0)
-    inner = _rotation_vectors(quats[:-2], quats[2:]) / (2.0 * dt)
-    return np.concatenate((inner[:1], inner, inner[-1:]))
-
-
-def _rotation_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return log(end start*), (n, 3)."""
-    result = np.empty((len(start), 3))
-    relative, back = np.empty(4), np.empty(4)
-    for i in range(len(start)):
-        mujoco.mju_negQuat(back, start[i])
-        mujoco.mju_mulQuat(relative, end[i], back)
-        mujoco.mju_quat2Vel(result[i], relative, 1.0)
-    return result
-
-
-def _bodies(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, ...]:
-    """Return positions, orientations, linear and angular velocities of all bodies but the world."""
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_comVel(model, data)
-    pos, angular = data.xpos[1:].copy(), data.cvel[1:, :3].copy()
-    centre = data.subtree_com[model.body_rootid[1:]]
-    linear = data.cvel[1:, 3:] + np.cross(angular, pos - centre)
-    return pos, data.xquat[1:].copy(), linear, angular
-
-
-def _check(recording: Recording, model: mujoco.MjModel) -> None:
-    if len(recording) < 2:
-        raise ValueError(f"The recording has {len(recording)} poses; at least 2 are needed.")
-    is_floating = model.njnt > 0 and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE
-    if not is_floating:
-        raise ValueError("The robot has no free joint, so that it cannot be put onto a motion.")
-    if recording.joint_pos.shape[1] != model.nq - 7:
-        raise ValueError(
-            f"The recording has {recording.joint_pos.shape[1]} joints, and the robot {model.nq - 7}."
-        )
-
-
-_ROOT_COLUMNS = 7
-_QUAT_TOLERANCE = 1e-2
+# CSV.
 
 
 def read_csv(
@@ -222,8 +221,15 @@ def read_csv(
             quaternion is not a unit quaternion.
     """
     path = Path(path)
-    table = _chosen_lines(path, _table(path), line_range)
-    first = 1 if line_range is None else line_range[0]
+    table = _table(path)
+    first, last = (1, len(table)) if line_range is None else line_range
+    if line_range is not None and not 1 <= first <= last <= len(table):
+        raise MotionFileError(
+            f"Lines {first} to {last} were asked for, and {path} has lines 1 to {len(table)}."
+        )
+    table = table[first - 1 : last]
+    if len(table) < 2:
+        raise MotionFileError(f"{path} has {len(table)} poses to read; at least 2 are needed.")
     expected = _ROOT_COLUMNS + len(joint_names)
     if table.shape[1] != expected:
         raise MotionFileError(
@@ -246,13 +252,6 @@ def read_csv(
     )
 
 
-def write_csv(path: str | Path, recording: Recording) -> None:
-    """Write a recording."""
-    quat = recording.root_quat[:, [1, 2, 3, 0]]
-    table = np.hstack((recording.root_pos, quat, recording.joint_pos))
-    np.savetxt(path, table, delimiter=",", fmt="%.8f")
-
-
 def _table(path: Path) -> np.ndarray:
     if not path.is_file():
         raise MotionFileError(f"There is no file {path}.")
@@ -267,14 +266,8 @@ def _table(path: Path) -> np.ndarray:
         ) from error
 
 
-def _chosen_lines(path: Path, table: np.ndarray, line_range: tuple[int, int] | None) -> np.ndarray:
-    if line_range is not None:
-        first, last = line_range
-        if not 1 <= first <= last <= len(table):
-            raise MotionFileError(
-                f"Lines {first} to {last} were asked for, and {path} has lines 1 to {len(table)}."
-            )
-        table = table[first - 1 : last]
-    if len(table) < 2:
-        raise MotionFileError(f"{path} has {len(table)} poses to read; at least 2 are needed.")
-    return table
+def write_csv(path: str | Path, recording: Recording) -> None:
+    """Write a recording."""
+    quat = recording.root_quat[:, [1, 2, 3, 0]]
+    table = np.hstack((recording.root_pos, quat, recording.joint_pos))
+    np.savetxt(path, table, delimiter=",", fmt="%.8f")

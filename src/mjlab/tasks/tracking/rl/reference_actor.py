@@ -53,7 +53,14 @@ class ReferenceActor(MLPModel):
         """
         begin = _place_of_command(env, self.obs_groups, command)
         names = command.robot.joint_names
-        term = _joint_positions(env)
+        manager = env.action_manager
+        terms = [manager.get_term(name) for name in manager.active_terms]
+        if len(terms) != 1 or not isinstance(terms[0], mdp.JointPositionAction):
+            raise ValueError(
+                "ReferenceActor needs one action term, of joint positions; there are "
+                f"{[type(term).__name__ for term in terms]}. Use class_name='MLPModel'."
+            )
+        term = terms[0]
         weight, bias = self.with_reference.weight, self.with_reference.bias
         device, indices = weight.device, [names.index(name) for name in term.target_names]
         columns = begin + torch.tensor(indices, device=device)
@@ -111,14 +118,3 @@ def _place_of_command(env: Any, groups: list[str], command: MotionCommand) -> in
         "`generated_commands` without scale, clip and history; these are "
         f"{[manager.active_terms[group] for group in groups]}. Add it, or use class_name='MLPModel'."
     )
-
-
-def _joint_positions(env: Any) -> mdp.JointPositionAction:
-    manager = env.action_manager
-    terms = [manager.get_term(name) for name in manager.active_terms]
-    if len(terms) != 1 or not isinstance(terms[0], mdp.JointPositionAction):
-        raise ValueError(
-            "ReferenceActor needs one action term, of joint positions; there are "
-            f"{[type(term).__name__ for term in terms]}. Use class_name='MLPModel'."
-        )
-    return terms[0]

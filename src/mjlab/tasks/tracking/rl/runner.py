@@ -1,4 +1,4 @@
-"""The runner of motion tracking."""
+"""The runner of motion tracking, and the exported policy together with the reference that it follows."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from mjlab.tasks.tracking.rl.reference_actor import ReferenceActor
 if TYPE_CHECKING:
     from mjlab.tasks.tracking.mdp.motion_library import MotionLibrary
 
-
 REFERENCE = (
     "joint_pos",
     "joint_vel",
@@ -30,60 +29,6 @@ REFERENCE = (
     "body_ang_vel_w",
 )
 """Tensors of a motion that the exported policy returns, with a row for each frame."""
-
-
-class PolicyWithReference(torch.nn.Module):
-    """What is exported: (obs, time_step) -> actions and the reference at that time step.
-
-    | input | shape | | output | shape |
-    | --- | --- | --- | --- | --- |
-    | `obs` | (N, observations) | | `actions` | (N, nj), the mean; the normalizer is inside |
-    | `time_step` | (N, 1) | | `joint_pos`, `joint_vel` | (N, nj) |
-    | | | | `body_pos_w`, `body_lin_vel_w`, `body_ang_vel_w` | (N, K, 3) |
-    | | | | `body_quat_w` | (N, K, 4) |
-
-    The time step is a number of frames, truncated to an integer and kept within the reference; it
-    counts over all motions, one after the other. Bodies are the tracked ones, without origins of
-    environments.
-    """
-
-    def __init__(self, policy: Any, motion: MotionLibrary) -> None:
-        """Take what rsl_rl's `as_onnx` returns, and the motions, which are copied.
-
-        Raises:
-            ValueError: the policy has other inputs than observations.
-        """
-        super().__init__()
-        self.policy = policy
-        if list(policy.input_names) != ["obs"]:
-            raise ValueError(
-                f"A policy with the inputs {list(policy.input_names)} cannot be exported with the "
-                "reference; one that reads observations only can."
-            )
-        for name in REFERENCE:
-            self.register_buffer(name, getattr(motion, name).detach().cpu().clone())
-        self.last_frame = motion.time_step_total - 1
-
-    @property
-    def input_names(self) -> list[str]:
-        """Names of the inputs."""
-        return ["obs", "time_step"]
-
-    @property
-    def output_names(self) -> list[str]:
-        """Names of the outputs."""
-        return ["actions", *REFERENCE]
-
-    def get_dummy_inputs(self) -> tuple[torch.Tensor, ...]:
-        """Return inputs of the right shapes."""
-        return (*self.policy.get_dummy_inputs(), torch.zeros(1, 1))
-
-    def forward(self, obs: torch.Tensor, time_step: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the outputs."""
-        frame = time_step.long().squeeze(-1).clamp(0, self.last_frame)
-        return (self.policy(obs), *(getattr(self, name)[frame] for name in REFERENCE))
-
-
 logger = logging.getLogger(__name__)
 _FAILURES = "motion_failures"
 
@@ -211,7 +156,12 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
         return sampler if isinstance(sampler, HardSegmentSampler) else None
 
     def _keep_motions(self, folder: Path) -> None:
-        files = self._motion_files
+        command = self.motion_command
+        if isinstance(command, MotionCommand):
+            files = command.motion_files
+        else:
+            path = Path(getattr(command.cfg, "motion_file", ""))
+            files = (path,) if path.is_file() else ()
         new = record_motions(files, folder, self._registry_name) if files else []
         # Whoever has a live run at Weights & Biases has imported wandb.
         wandb: Any = sys.modules.get("wandb")
@@ -224,14 +174,6 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
             self._is_marked = True
             wandb.run.use_artifact(full_artifact_name(self._registry_name))
 
-    @property
-    def _motion_files(self) -> tuple[Path, ...]:
-        command = self.motion_command
-        if isinstance(command, MotionCommand):
-            return command.motion_files
-        path = getattr(command.cfg, "motion_file", "")
-        return (Path(path),) if path and Path(path).is_file() else ()
-
 
 def _motion_command(env: Any) -> Any:
     manager = env.command_manager
@@ -243,3 +185,55 @@ def _motion_command(env: Any) -> Any:
             f"commands are {list(terms)}."
         )
     return found[0] if found else terms["motion"]
+
+
+class PolicyWithReference(torch.nn.Module):
+    """What is exported: (obs, time_step) -> actions and the reference at that time step.
+
+    | input | shape | | output | shape |
+    | --- | --- | --- | --- | --- |
+    | `obs` | (N, observations) | | `actions` | (N, nj), the mean; the normalizer is inside |
+    | `time_step` | (N, 1) | | `joint_pos`, `joint_vel` | (N, nj) |
+    | | | | `body_pos_w`, `body_lin_vel_w`, `body_ang_vel_w` | (N, K, 3) |
+    | | | | `body_quat_w` | (N, K, 4) |
+
+    The time step is a number of frames, truncated to an integer and kept within the reference; it
+    counts over all motions, one after the other. Bodies are the tracked ones, without origins of
+    environments.
+    """
+
+    def __init__(self, policy: Any, motion: MotionLibrary) -> None:
+        """Take what rsl_rl's `as_onnx` returns, and the motions, which are copied.
+
+        Raises:
+            ValueError: the policy has other inputs than observations.
+        """
+        super().__init__()
+        self.policy = policy
+        if list(policy.input_names) != ["obs"]:
+            raise ValueError(
+                f"A policy with the inputs {list(policy.input_names)} cannot be exported with the "
+                "reference; one that reads observations only can."
+            )
+        for name in REFERENCE:
+            self.register_buffer(name, getattr(motion, name).detach().cpu().clone())
+        self.last_frame = motion.time_step_total - 1
+
+    @property
+    def input_names(self) -> list[str]:
+        """Names of the inputs."""
+        return ["obs", "time_step"]
+
+    @property
+    def output_names(self) -> list[str]:
+        """Names of the outputs."""
+        return ["actions", *REFERENCE]
+
+    def get_dummy_inputs(self) -> tuple[torch.Tensor, ...]:
+        """Return inputs of the right shapes."""
+        return (*self.policy.get_dummy_inputs(), torch.zeros(1, 1))
+
+    def forward(self, obs: torch.Tensor, time_step: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return the outputs."""
+        frame = time_step.long().squeeze(-1).clamp(0, self.last_frame)
+        return (self.policy(obs), *(getattr(self, name)[frame] for name in REFERENCE))

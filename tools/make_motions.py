@@ -1,6 +1,6 @@
-"""Makes the motions of this folder, by inverse kinematics, from the descriptions below.
+"""Make the motions that ship with the package, by inverse kinematics, from the descriptions below.
 
-    uv run --group dev python src/mjlab/tasks/tracking/motions/make_motions.py
+    uv run --group dev python tools/make_motions.py
 
 A description says in plain words where the feet step, how far the body goes down or leans, and which
 joints move. From it follow, in this order:
@@ -29,6 +29,7 @@ from scipy.linalg import solve_banded
 from mjlab.asset_zoo.robots import get_g1_robot_cfg
 from mjlab.tasks.tracking.motion_file import Motion, write_motion
 from mjlab.tasks.tracking.motion_recording import Recording, make_motion
+from mjlab.tasks.tracking.motion_sources import SHIPPED
 
 FPS = 50.0
 _GRAVITY = 9.81
@@ -385,7 +386,7 @@ def main() -> None:
     """Write all motions, or those named on the command line."""
     parser = argparse.ArgumentParser(description="Make the motions that ship with the package.")
     parser.add_argument("names", nargs="*", help="motions to make; all if none is named")
-    parser.add_argument("--folder", type=Path, default=Path(__file__).parent)
+    parser.add_argument("--folder", type=Path, default=SHIPPED)
     arguments = parser.parse_args()
     for description in DESCRIPTIONS:
         if not arguments.names or description.name in arguments.names:
