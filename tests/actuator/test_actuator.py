@@ -63,16 +63,16 @@ class Custom(Actuator[CustomCfg]):
 @pytest.mark.parametrize(
     ("fields", "named"),
     [
-        ({"armature": -0.1}, "armature=-0.1"),
-        ({"frictionloss": -1.0}, "frictionloss=-1.0"),
-        ({"viscous_damping": float("nan")}, "viscous_damping=nan"),
-        ({"delay_min_lag": -1}, "delay_min_lag=-1"),
-        ({"delay_min_lag": 3, "delay_max_lag": 2}, "delay_max_lag=2: it is below delay_min_lag=3"),
-        ({"delay_hold_prob": 1.5}, "delay_hold_prob=1.5"),
-        ({"delay_update_period": -1}, "delay_update_period=-1"),
-        ({"transmission_type": "wheel"}, "transmission_type='wheel'"),
-        ({"effort_limit": -2.0}, "effort_limit=-2.0"),
-        ({"transmission_type": TransmissionType.SITE, "armature": 0.1}, "armature=0.1"),
+        ({"armature": -0.1}, "armature: .*-0.1"),
+        ({"frictionloss": -1.0}, "frictionloss: .*-1.0"),
+        ({"viscous_damping": float("nan")}, "viscous_damping: .*nan"),
+        ({"delay_min_lag": -1}, "delay_min_lag: .*-1"),
+        ({"delay_min_lag": 3, "delay_max_lag": 2}, r"delay_max_lag: .*\[3, inf\], got 2"),
+        ({"delay_hold_prob": 1.5}, "delay_hold_prob: .*1.5"),
+        ({"delay_update_period": -1}, "delay_update_period: .*-1"),
+        ({"transmission_type": "wheel"}, "transmission_type: .*tendon.*'wheel'"),
+        ({"effort_limit": -2.0}, "effort_limit: .*-2.0"),
+        ({"transmission_type": TransmissionType.SITE, "armature": 0.1}, "armature: .*site.*0.1"),
     ],
 )
 def test_figures_that_make_no_sense_are_refused_by_name(fields, named):
@@ -83,7 +83,7 @@ def test_figures_that_make_no_sense_are_refused_by_name(fields, named):
 def test_a_config_changed_after_it_was_made_is_checked_when_built(make_world):
     cfg = motor_cfg()
     cfg.delay_min_lag = 5
-    with pytest.raises(ValueError, match="delay_max_lag=0: it is below delay_min_lag=5"):
+    with pytest.raises(ValueError, match=r"delay_max_lag: .*\[5, inf\], got 0"):
         make_world(cfg)
 
 

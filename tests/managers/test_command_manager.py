@@ -183,7 +183,7 @@ def test_build_must_return_a_command(env):
     ("low", "high"), [(2.0, 1.0), (-1.0, 1.0), (-2.0, -1.0), (float("nan"), 1.0)]
 )
 def test_a_time_range_that_is_negative_or_turned_round_is_refused(env, low, high):
-    with pytest.raises(ValueError, match="resampling_time_range is .* must not be negative"):
+    with pytest.raises(ValueError, match=f"resampling_time_range.*{low}, {high}"):
         make(env, low, high)
 
 

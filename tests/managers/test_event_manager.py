@@ -44,7 +44,7 @@ def test_other_modes_do_not_fire(env):
 
 
 def test_an_unknown_mode_is_refused(env):
-    with pytest.raises(ValueError, match=r"'a'.*'rest'.*startup.*reset.*interval.*step"):
+    with pytest.raises(ValueError, match=r"'a'.*startup.*reset.*interval.*step.*'rest'"):
         make(env, "rest")
     manager, _ = make(env, "step")
     with pytest.raises(ValueError, match="'rest'"):

@@ -461,7 +461,7 @@ def test_saved_state_continues_as_if_nothing_had_happened(env):
     [(1.0, 2.0, 3.0), torch.ones(3), torch.ones(1, 4, 2), (), "big", {"a": 1.0}, ((1.0,), (2.0,))],
 )
 def test_a_scale_that_does_not_fit_is_refused(env, scale):
-    with pytest.raises(ValueError, match="'g/t': scale"):
+    with pytest.raises(ValueError, match="'g/t' scale"):
         make(env, ObservationTermCfg(func=state, scale=scale))
 
 
@@ -474,7 +474,7 @@ def test_a_scale_is_one_number_or_one_for_each_component(env, scale):
 def test_a_scale_that_is_replaced_later_is_checked_too(env):
     manager = make(env)
     manager.get_term_cfg("g", "t").scale = (1.0, 2.0, 3.0)
-    with pytest.raises(ValueError, match=r"'g/t': scale has shape \(3,\)"):
+    with pytest.raises(ValueError, match=r"'g/t' scale.*\(3,\)"):
         manager.compute(update_history=True)
 
 
@@ -482,7 +482,7 @@ def test_a_scale_that_is_replaced_later_is_checked_too(env):
     "clip", [(1.0, -1.0), (1.0,), (0.0, 1.0, 2.0), 1.0, (None, 1.0), "01", (float("nan"), 1.0)]
 )
 def test_a_clip_is_a_pair_in_order(env, clip):
-    with pytest.raises(ValueError, match=r"'g/t': clip is .*\(lowest, highest\)"):
+    with pytest.raises(ValueError, match=r"'g/t' clip.*\(low, high\)"):
         make(env, ObservationTermCfg(func=state, clip=clip))
 
 
@@ -495,7 +495,7 @@ def test_a_clip_may_be_open_on_one_side_or_a_point(env):
 @pytest.mark.parametrize("corruption", [False, True])
 @pytest.mark.parametrize("noise", [0.1, UniformNoiseCfg, (-0.1, 0.1)])
 def test_noise_is_the_config_of_a_noise(env, noise, corruption):
-    with pytest.raises(ValueError, match="'g/t': noise is .*UniformNoiseCfg"):
+    with pytest.raises(ValueError, match="'g/t' noise.*UniformNoiseCfg"):
         make(env, ObservationTermCfg(func=state, noise=noise), enable_corruption=corruption)
 
 

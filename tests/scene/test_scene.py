@@ -121,7 +121,7 @@ def test_errors_name_the_entity():
 
 @pytest.mark.parametrize("num_envs", [0, -3])
 def test_the_number_of_environments_must_be_positive(num_envs):
-    with pytest.raises(ValueError, match=f"num_envs is {num_envs}; it has to be at least 1"):
+    with pytest.raises(ValueError, match=f"num_envs.*{num_envs}"):
         build(num_envs=num_envs)
 
 

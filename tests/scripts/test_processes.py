@@ -14,8 +14,9 @@ from process_runs import SMALL, Ended, ProcessRun
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from mjlab.rl.checkpoint import load_checkpoint
+from mjlab.scripts.environments import training_env
 from mjlab.scripts.run_folder import checkpoints_in, read_run_info
-from mjlab.scripts.train import _build_env, parse_train_flags
+from mjlab.scripts.train import parse_train_flags
 from mjlab.utils.processes import ProcessRank, available_cores
 from mjlab.utils.random import process_seed
 
@@ -79,7 +80,7 @@ def test_the_first_alone_writes_files_and_prints(pair):
 @pytest.mark.parametrize(("rank", "render_mode"), [(0, "rgb_array"), (1, None)])
 def test_the_first_alone_renders(tmp_path, rank, render_mode):
     cfg = parse_train_flags(TASK, ["--num-envs", "2", "--video"], "train")
-    env = _build_env(cfg, "cpu", tmp_path, ProcessRank(rank, 2, rank, 2))
+    env = training_env(cfg, "cpu", tmp_path, ProcessRank(rank, 2, rank, 2))
     assert env.render_mode == render_mode
     env.close()
 

@@ -7,11 +7,12 @@ import os
 import signal
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from viewer_fakes import FakeEnv, push
 
-from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction, forget
+from mjlab.viewer.base import BaseViewer, TermHistory, VerbosityLevel, ViewerAction, forget
 
 
 class ListViewer(BaseViewer):
@@ -210,7 +211,7 @@ def test_rates_are_logged_for_those_who_ask_for_detail(caplog) -> None:
 
 
 def test_a_frame_rate_that_is_not_positive_is_refused() -> None:
-    with pytest.raises(ValueError, match="frame_rate is 0"):
+    with pytest.raises(ValueError, match="frame_rate.*0"):
         ListViewer(FakeEnv(1), push(), frame_rate=0)
 
 
@@ -239,3 +240,15 @@ def test_a_subclass_offers_other_speeds() -> None:
     viewer.reset_speed()
     assert viewer.target_realtime == 0.9
     assert [2.0**n for n in range(-5, 4)] == BaseViewer.SPEED_MULTIPLIERS
+
+
+def test_only_the_latest_points_are_kept_and_averaged_over_finite_ones() -> None:
+    history = TermHistory(length=4)
+    for value in (1.0, 2.0, float("inf"), 4.0, 6.0):
+        history.add([("a", [value])])
+    np.testing.assert_array_equal(history.values("a"), [2.0, np.nan, 4.0, 6.0])
+    assert history.mean("a") == 4.0
+    history.clear()
+    assert history.names == ["a"]
+    assert history.mean("a") == 0.0
+    assert len(history.values("unknown")) == 0

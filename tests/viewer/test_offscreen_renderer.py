@@ -51,7 +51,7 @@ def test_wrong_order_of_calls_is_refused_with_what_to_do(monkeypatch) -> None:
 
 @pytest.mark.parametrize(
     ("fields", "message"),
-    [({"max_extra_envs": -1}, "max_extra_envs is -1"), ({"entity_name": "x"}, "not in the scene")],
+    [({"max_extra_envs": -1}, "max_extra_envs.*-1"), ({"entity_name": "x"}, "entity_name 'x'")],
 )
 def test_bad_configurations_are_refused_before_any_drawing(fields, message) -> None:
     with pytest.raises(ValueError, match=message):
@@ -86,6 +86,21 @@ def test_a_mujoco_without_renderer_gives_that_error_too(monkeypatch) -> None:
         make(FakeEnv(1)).initialize()
 
 
+def test_a_missing_egl_is_called_so_and_what_to_install_is_named(monkeypatch) -> None:
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    noise = AttributeError("'NoneType' object has no attribute 'eglQueryString'")
+    text = str(RenderingUnavailableError.offscreen(noise))
+    assert "(MUJOCO_GL=unset): no EGL library or driver was found. " in text
+    assert "NoneType" not in text
+    assert "apt-get install libegl1 libgl1 libgl1-mesa-dri" in text
+
+
+def test_another_reason_is_kept_in_one_line() -> None:
+    text = str(RenderingUnavailableError.offscreen("Cannot initialize\n  a device."))
+    assert "Cannot initialize a device. To render" in text
+    assert "apt-get install libegl1 libgl1 libgl1-mesa-dri" in text
+
+
 def test_the_scenes_own_model_is_left_alone() -> None:
     env = FakeEnv(1)
     before = (env.sim.mj_model.stat.extent, env.sim.mj_model.vis.global_.fovy)
@@ -96,14 +111,20 @@ def test_the_scenes_own_model_is_left_alone() -> None:
 
 
 @pytest.mark.usefixtures("gl")
-def test_it_renders_without_a_display_although_mujoco_was_imported_before_mjlab() -> None:
+@pytest.mark.parametrize("chosen_first", [None, "disable"])
+def test_it_renders_without_a_display_although_mujoco_was_imported_before_mjlab(
+    chosen_first,
+) -> None:
     code = (
-        "import mujoco\n"
+        "import os, mujoco\n"
+        "os.environ.pop('MUJOCO_GL', None)\n"
         "from mjlab.viewer.offscreen_renderer import open_renderer\n"
         "open_renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).close()"
     )
     without = ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")
     environ = {name: value for name, value in os.environ.items() if name not in without}
+    if chosen_first is not None:
+        environ["MUJOCO_GL"] = chosen_first
     subprocess.run([sys.executable, "-c", code], check=True, env=environ)
 
 
@@ -140,7 +161,7 @@ class TestPictures:
         side = picture(env, camera="side")
         assert differs(side, picture(env))
         assert not differs(side, picture(env, camera=0))
-        with pytest.raises(ValueError, match=r"no camera 'top'.*\['side'\]"):
+        with pytest.raises(ValueError, match=r"camera 'top'.*\['side'\]"):
             picture(env, camera="top")
 
     def test_neighbours_are_drawn_with_their_own_state(self) -> None:

@@ -3,10 +3,15 @@
 An `Actuator` object stands for one `ActuatorCfg` of an entity, and so for all joints, tendons or
 sites (its *targets*) that the config's patterns match. It adds MuJoCo actuators (*elements*) to the
 spec, and in every physics substep turns the entity's commands into their controls.
+
+An environment step runs `decimation` physics substeps. If no actuator and no sensor acts between
+them, the engine runs all of them in one dispatch, which makes CPU runs several times as fast.
+`constant_within_step` marks methods that allow this.
 """
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,6 +21,13 @@ import mujoco
 import torch
 
 from mjlab.utils.buffers import DelayBuffer
+from mjlab.utils.errors import (
+    UnsupportedError,
+    WrongStateError,
+    check_in_range,
+    check_one_of,
+    check_positive,
+)
 from mjlab.utils.indexing import Columns, EnvIds, read_columns, write_columns
 from mjlab.utils.mujoco import CommandField as CommandField
 from mjlab.utils.mujoco import control_columns
@@ -24,154 +36,8 @@ from mjlab.utils.spec import apply_target_overrides
 from mjlab.utils.state import stateful
 
 if TYPE_CHECKING:
-    import mujoco
-
-    from mjlab.entity import Entity, EntityData
-    from mjlab.utils.buffers import DelayBuffer
-    from mjlab.utils.mujoco import CommandField
-
-
-# MERGED mjlab.actuator.actuator: Marks for work whose effect is the same at every physics substep of one environment step.
-#
-# An environment step runs `decimation` physics substeps. Where nothing has to act between them, the
-# engine runs all of them in one dispatch, which is where a CPU run gets its speed. A method is only
-# trusted to be constant when its author says so: a subclass that overrides it loses the mark.
-
-F = TypeVar("F", bound=Callable[..., Any])
-_MARK = "_constant_within_step"
-
-
-def constant_within_step(function: F) -> F:
-    """Mark `function` as having the same effect at every substep of an environment step."""
-    setattr(function, _MARK, True)
-    return function
-
-
-def is_constant_within_step(function: Callable[..., Any]) -> bool:
-    """Return whether `function` (plain or bound) carries the mark of `constant_within_step`."""
-    return bool(getattr(function, _MARK, False))
-
-
-# MERGED mjlab.actuator.actuator: What an actuator is told, and where in an entity's data that stands.
-
-
-@dataclass
-class ActuatorCmd:
-    """Commands and feedback of one actuator's targets, (N, number of targets) each."""
-
-    position_target: torch.Tensor
-    """Joint position (rad or m) or tendon length (m) to reach."""
-    velocity_target: torch.Tensor
-    """Velocity to reach (rad/s or m/s)."""
-    effort_target: torch.Tensor
-    """Force to add (N m or N), or another input, such as a voltage."""
-    pos: torch.Tensor
-    """Current position. It is never delayed."""
-    vel: torch.Tensor
-    """Current velocity. It is never delayed."""
-
-
-# Fields of EntityData: three targets, position, velocity. None reads as zero.
-_FIELDS = {
-    TransmissionType.JOINT: (
-        "joint_pos_target", "joint_vel_target", "joint_effort_target", "joint_pos", "joint_vel",
-    ),
-    TransmissionType.TENDON: (
-        "tendon_len_target", "tendon_vel_target", "tendon_effort_target", "tendon_len",
-        "tendon_vel",
-    ),
-    TransmissionType.SITE: (None, None, "site_effort_target", None, None),
-}  # fmt: skip
-_POSITIONS = {"position": 0, "velocity": 1, "effort": 2}
-
-
-def target_field(transmission: TransmissionType, command: CommandField) -> str | None:
-    """Return the field of EntityData that holds one kind of target."""
-    return _FIELDS[transmission][_POSITIONS[command]]
-
-
-def read_command(data: EntityData, transmission: TransmissionType, columns: Columns) -> ActuatorCmd:
-    """Return the command and feedback in some columns; views of live data if they are a slice."""
-    names = _FIELDS[transmission]
-    values = [
-        None if name is None else read_columns(getattr(data, name), columns) for name in names
-    ]
-    present = [value for value in values if value is not None]
-    zeros = torch.zeros_like(present[0]) if len(present) < len(names) else present[0]
-    return ActuatorCmd(*(zeros if value is None else value for value in values))
-
-
-# MERGED mjlab.actuator.actuator: Delaying commands: all targets of a line together, so that they are always of the same age.
-
-
-def delay_command(
-    buffer: DelayBuffer,
-    position_target: torch.Tensor,
-    velocity_target: torch.Tensor,
-    effort_target: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Append a command, (N, n) three times, to a delay line, and return the delayed command.
-
-    One line for all three keeps them together: they are always of the same age.
-    """
-    position, velocity, effort = delay_rows(
-        buffer, (position_target, velocity_target, effort_target), None
-    )
-    return position, velocity, effort
-
-
-def delay_rows(
-    buffer: DelayBuffer, values: tuple[torch.Tensor, ...], env_ids: EnvIds
-) -> tuple[torch.Tensor, ...]:
-    """Return `values`, each (N, n_i), delayed together by one line.
-
-    With `env_ids` these environments have just been reset: their lines start anew, filled with
-    what they are given, and all other lines stay as they are. Only the rows `env_ids` of the
-    result mean something then.
-    """
-    widths = [value.shape[1] for value in values]
-    together = torch.cat(values, dim=1) if len(values) > 1 else values[0]
-    if env_ids is None:
-        buffer.append(together)
-        return buffer.compute().split(widths, dim=1)
-    if not buffer.is_initialized:
-        # A line takes its shape from what is appended first; then all environments are new to it.
-        buffer.append(torch.zeros_like(together))
-        buffer.reset()
-    buffer.backfill(together, env_ids)
-    return buffer.peek().split(widths, dim=1)
-
-
-# MERGED mjlab.actuator.actuator: What the two kinds of actuator groups share: who may join one, and who shares a delay line.
-
-_METHODS = ("compute", "compute_after_reset", "get_command", "apply_delay", "apply_controls")
-
-
-def acts_like(actuator: Actuator, base: type[Actuator]) -> bool:
-    """Return whether the actuator's class left alone what a group does in place of a `base`."""
-    return all(getattr(type(actuator), name) is getattr(base, name) for name in _METHODS)
-
-
-def delay_settings(actuator: Actuator) -> tuple[Any, ...]:
-    """Return what has to agree for actuators to share a delay line."""
-    cfg = actuator.cfg
-    return (
-        type(actuator),
-        actuator.transmission_type,
-        cfg.delay_min_lag,
-        cfg.delay_max_lag,
-        cfg.delay_hold_prob,
-        cfg.delay_update_period,
-        cfg.delay_per_env_phase,
-    )
-
-
-def share_line(members: Sequence[Actuator], num_envs: int, device: str) -> DelayBuffer:
-    """Make one delay line for actuators with equal settings, and have the first one reset it."""
-    line = members[0].make_delay_buffer(num_envs, device)
-    for k, actuator in enumerate(members):
-        actuator.join_group(line, resets_delay=k == 0)
-    return line
+    from mjlab.entity.data import EntityData
+    from mjlab.entity.entity import Entity
 
 
 @dataclass(kw_only=True)
@@ -215,55 +81,44 @@ class ActuatorCfg(ABC):
                 f"{self.target_names_expr!r}; give a tuple of patterns, "
                 f"({self.target_names_expr!r},)."
             )
-        if self.transmission_type in list(TransmissionType):
-            # Configs may also say "joint".
-            self.transmission_type = TransmissionType(self.transmission_type)
         self.validate()
 
     def validate(self) -> None:
         """Check the figures; see the class. Subclasses extend it."""
-        if self.transmission_type not in list(TransmissionType):
-            self._refuse("transmission_type", "choose joint, tendon or site")
-        self._validate_target_properties()
-        self._validate_delay()
+        kinds = [kind.value for kind in TransmissionType]
+        check_one_of(self._label("transmission_type"), self.transmission_type, kinds)
+        # Configs may also say "joint".
+        self.transmission_type = TransmissionType(self.transmission_type)
+        on_site = self.transmission_type == TransmissionType.SITE
+        if on_site and not self._accepts_site:
+            raise ValueError(
+                f"{self._label('transmission_type')}: a site has no position or velocity to "
+                "control; use a joint or a tendon, or BuiltinMotorActuatorCfg or IdealPdActuatorCfg."
+            )
+        for name, low, high in (
+            ("delay_min_lag", 0, math.inf),
+            ("delay_max_lag", self.delay_min_lag, math.inf),
+            ("delay_hold_prob", 0.0, 1.0),
+            ("delay_update_period", 0, math.inf),
+        ):
+            check_in_range(self._label(name), getattr(self, name), low, high)
+        for name in ("armature", "frictionloss", "viscous_damping"):
+            value = getattr(self, name) or 0.0
+            check_in_range(self._label(name), value, 0.0, math.inf)
+            if on_site and value:
+                raise ValueError(f"{self._label(name)}: expected None for a site, got {value}.")
         for name in self._positive:
             value = getattr(self, name)
-            if value is not None and not value > 0.0:
-                self._refuse(name, "it must be positive")
+            if value is not None:
+                check_positive(self._label(name), value)
 
     @abstractmethod
     def build(self, entity: Entity, target_ids: list[int], target_names: list[str]) -> Actuator:
         """Return the actuator for these targets (indices and names within the entity)."""
 
-    def _validate_target_properties(self) -> None:
-        on_site = self.transmission_type == TransmissionType.SITE
-        if on_site and not self._accepts_site:
-            self._refuse(
-                "transmission_type", "a site has no position or velocity to control; use a "
-                "joint or a tendon, or BuiltinMotorActuatorCfg or IdealPdActuatorCfg"
-            )  # fmt: skip
-        for name in ("armature", "frictionloss", "viscous_damping"):
-            value = getattr(self, name)
-            if value is not None and not value >= 0.0:
-                self._refuse(name, "it must be at least 0, or None to keep the target's own")
-            if value and on_site:
-                self._refuse(name, "a site has no such property; leave it None")
-
-    def _validate_delay(self) -> None:
-        if self.delay_min_lag < 0:
-            self._refuse("delay_min_lag", "a lag is a number of substeps, at least 0")
-        if self.delay_max_lag < self.delay_min_lag:
-            self._refuse("delay_max_lag", f"it is below delay_min_lag={self.delay_min_lag}")
-        if not 0.0 <= self.delay_hold_prob <= 1.0:
-            self._refuse("delay_hold_prob", "a probability is between 0 and 1")
-        if self.delay_update_period < 0:
-            self._refuse("delay_update_period", "it is a number of substeps; 0 draws at each")
-
-    def _refuse(self, field: str, why: str) -> None:
-        raise ValueError(
-            f"{type(self).__name__} for {self.target_names_expr}: "
-            f"{field}={getattr(self, field)!r}: {why}."
-        )
+    def _label(self, field: str) -> str:
+        """Return how errors name a field."""
+        return f"{type(self).__name__} for {self.target_names_expr}: {field}"
 
 
 ActuatorCfgT = TypeVar("ActuatorCfgT", bound=ActuatorCfg)
@@ -381,7 +236,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         """
         elements = self._ordered_elements()
         if not elements:
-            raise RuntimeError(
+            raise WrongStateError(
                 f"{type(self).__name__} for {self._target_names} has no MuJoCo actuators: its "
                 "edit_spec must append what it adds to self._mjs_actuators, and run before the "
                 "model is compiled."
@@ -461,7 +316,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
 
         Only kinds that can be evaluated together have one; see `FusedActuatorGroup`.
         """
-        raise NotImplementedError("This kind of actuator has only `compute`, no control law.")
+        raise UnsupportedError("This kind of actuator has only `compute`, no control law.")
 
     def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
         """Compute the controls of this actuator and write them to the simulation.
@@ -495,7 +350,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         if self._delay_buffer is None:
             return cmd
         if self._in_group:
-            raise RuntimeError(
+            raise WrongStateError(
                 f"The delay of {type(self).__name__} for {self._target_names} is run by its group, "
                 "together with that of like actuators. Write controls through "
                 "Entity.write_data_to_sim()."
@@ -505,18 +360,31 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
 
     def _initialized(self, value: torch.Tensor | None) -> torch.Tensor:
         if value is None:
-            raise RuntimeError(
+            raise WrongStateError(
                 f"{type(self).__name__} for {self._target_names} is not initialized yet. Its ids "
                 "are known after Scene.initialize()."
             )
         return value
 
 
-def _int_tensor(values: list[int], device: str) -> torch.Tensor:
-    return torch.tensor(values, dtype=torch.int64, device=device)
+# Work whose effect is the same at every substep of an environment step.
+
+F = TypeVar("F", bound=Callable[..., Any])
+_MARK = "_constant_within_step"
 
 
-# MERGED mjlab.actuator.actuator: Actuators whose control law MuJoCo evaluates: the control is a command, passed through.
+def constant_within_step(function: F) -> F:
+    """Mark `function` as having the same effect at every substep of an environment step.
+
+    A subclass that overrides the method loses the mark.
+    """
+    setattr(function, _MARK, True)
+    return function
+
+
+def is_constant_within_step(function: Callable[..., Any]) -> bool:
+    """Return whether `function` (plain or bound) carries the mark of `constant_within_step`."""
+    return bool(getattr(function, _MARK, False))
 
 
 class DirectActuator(Actuator[ActuatorCfgT]):
@@ -562,3 +430,129 @@ class DirectActuator(Actuator[ActuatorCfgT]):
             frictionloss=self.cfg.frictionloss,
             viscous_damping=self.cfg.viscous_damping,
         )
+
+
+# Commands.
+
+
+@dataclass
+class ActuatorCmd:
+    """Commands and feedback of one actuator's targets, (N, number of targets) each."""
+
+    position_target: torch.Tensor
+    """Joint position (rad or m) or tendon length (m) to reach."""
+    velocity_target: torch.Tensor
+    """Velocity to reach (rad/s or m/s)."""
+    effort_target: torch.Tensor
+    """Force to add (N m or N), or another input, such as a voltage."""
+    pos: torch.Tensor
+    """Current position. It is never delayed."""
+    vel: torch.Tensor
+    """Current velocity. It is never delayed."""
+
+
+# Fields of EntityData: three targets, position, velocity. None reads as zero.
+_FIELDS = {
+    TransmissionType.JOINT: (
+        "joint_pos_target", "joint_vel_target", "joint_effort_target", "joint_pos", "joint_vel",
+    ),
+    TransmissionType.TENDON: (
+        "tendon_len_target", "tendon_vel_target", "tendon_effort_target", "tendon_len",
+        "tendon_vel",
+    ),
+    TransmissionType.SITE: (None, None, "site_effort_target", None, None),
+}  # fmt: skip
+_POSITIONS = {"position": 0, "velocity": 1, "effort": 2}
+
+
+def target_field(transmission: TransmissionType, command: CommandField) -> str | None:
+    """Return the field of EntityData that holds one kind of target."""
+    return _FIELDS[transmission][_POSITIONS[command]]
+
+
+def read_command(data: EntityData, transmission: TransmissionType, columns: Columns) -> ActuatorCmd:
+    """Return the command and feedback in some columns; views of live data if they are a slice."""
+    names = _FIELDS[transmission]
+    values = [
+        None if name is None else read_columns(getattr(data, name), columns) for name in names
+    ]
+    present = [value for value in values if value is not None]
+    zeros = torch.zeros_like(present[0]) if len(present) < len(names) else present[0]
+    return ActuatorCmd(*(zeros if value is None else value for value in values))
+
+
+# Delays.
+
+
+def delay_command(
+    buffer: DelayBuffer,
+    position_target: torch.Tensor,
+    velocity_target: torch.Tensor,
+    effort_target: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Append a command, (N, n) three times, to a delay line, and return the delayed command.
+
+    One line for all three keeps them together: they are always of the same age.
+    """
+    position, velocity, effort = delay_rows(
+        buffer, (position_target, velocity_target, effort_target), None
+    )
+    return position, velocity, effort
+
+
+def delay_rows(
+    buffer: DelayBuffer, values: tuple[torch.Tensor, ...], env_ids: EnvIds
+) -> tuple[torch.Tensor, ...]:
+    """Return `values`, each (N, n_i), delayed together by one line.
+
+    With `env_ids` these environments have just been reset: their lines start anew, filled with
+    what they are given, and all other lines stay as they are. Only the rows `env_ids` of the
+    result mean something then.
+    """
+    widths = [value.shape[1] for value in values]
+    together = torch.cat(values, dim=1) if len(values) > 1 else values[0]
+    if env_ids is None:
+        buffer.append(together)
+        return buffer.compute().split(widths, dim=1)
+    if not buffer.is_initialized:
+        # A line takes its shape from what is appended first; then all environments are new to it.
+        buffer.append(torch.zeros_like(together))
+        buffer.reset()
+    buffer.backfill(together, env_ids)
+    return buffer.peek().split(widths, dim=1)
+
+
+# Groups of actuators, written to the simulation together.
+
+_METHODS = ("compute", "compute_after_reset", "get_command", "apply_delay", "apply_controls")
+
+
+def acts_like(actuator: Actuator, base: type[Actuator]) -> bool:
+    """Return whether the actuator's class left alone what a group does in place of a `base`."""
+    return all(getattr(type(actuator), name) is getattr(base, name) for name in _METHODS)
+
+
+def delay_settings(actuator: Actuator) -> tuple[Any, ...]:
+    """Return what has to agree for actuators to share a delay line."""
+    cfg = actuator.cfg
+    return (
+        type(actuator),
+        actuator.transmission_type,
+        cfg.delay_min_lag,
+        cfg.delay_max_lag,
+        cfg.delay_hold_prob,
+        cfg.delay_update_period,
+        cfg.delay_per_env_phase,
+    )
+
+
+def share_line(members: Sequence[Actuator], num_envs: int, device: str) -> DelayBuffer:
+    """Make one delay line for actuators with equal settings, and have the first one reset it."""
+    line = members[0].make_delay_buffer(num_envs, device)
+    for k, actuator in enumerate(members):
+        actuator.join_group(line, resets_delay=k == 0)
+    return line
+
+
+def _int_tensor(values: list[int], device: str) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.int64, device=device)

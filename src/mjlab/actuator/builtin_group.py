@@ -22,38 +22,15 @@ from mjlab.actuator.builtin_actuator import (
     BuiltinVelocityActuator,
 )
 from mjlab.utils.buffers import DelayBuffer
-from mjlab.utils.indexing import (
-    Columns,
-    EnvIds,
-    as_columns,
-    read_columns,
-    write_columns,
-)
+from mjlab.utils.indexing import Columns, EnvIds, as_columns, read_columns, write_columns
 
 if TYPE_CHECKING:
-    from mjlab.entity import EntityData
+    from mjlab.entity.data import EntityData
 
 BuiltinActuatorType = (
     BuiltinMotorActuator | BuiltinMuscleActuator | BuiltinPositionActuator | BuiltinVelocityActuator
 )
 """Actuators whose control is one target."""
-
-
-@dataclass
-class _Route:
-    """Targets that go to controls: columns `source` of a target field to columns `ctrl`."""
-
-    field: str
-    source: Columns
-    ctrl: Columns
-
-
-@dataclass
-class _DelayedRoutes:
-    """Routes whose commands are delayed together."""
-
-    routes: list[_Route]
-    line: DelayBuffer
 
 
 @dataclass
@@ -86,9 +63,14 @@ class BuiltinActuatorGroup:
         for actuator in direct:
             actuator.join_group(None, resets_delay=False)
         self._routes = _plan(direct, device)
+        lines: dict[Any, list[DirectActuator]] = {}
+        for actuator in self._actuators:
+            if actuator.has_delay:
+                own = None if actuator.shares_delay else id(actuator)
+                lines.setdefault((delay_settings(actuator), own), []).append(actuator)
         self._delayed_groups = [
             _DelayedRoutes(_plan(members, device), share_line(members, num_envs, device))
-            for members in _by_line(self._actuators).values()
+            for members in lines.values()
         ]
 
     def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
@@ -112,6 +94,23 @@ class BuiltinActuatorGroup:
                 write_columns(ctrl, route.ctrl, command, env_ids)
 
 
+@dataclass
+class _Route:
+    """Targets that go to controls: columns `source` of a target field to columns `ctrl`."""
+
+    field: str
+    source: Columns
+    ctrl: Columns
+
+
+@dataclass
+class _DelayedRoutes:
+    """Routes whose commands are delayed together."""
+
+    routes: list[_Route]
+    line: DelayBuffer
+
+
 def _passes_commands(actuator: Actuator) -> TypeGuard[DirectActuator]:
     # A site has no position or velocity target; where one is asked for, `compute` gives zeros.
     return (
@@ -119,15 +118,6 @@ def _passes_commands(actuator: Actuator) -> TypeGuard[DirectActuator]:
         and acts_like(actuator, DirectActuator)
         and all(target_field(actuator.transmission_type, name) for name in actuator.command_fields)
     )
-
-
-def _by_line(actuators: Sequence[DirectActuator]) -> dict[Any, list[DirectActuator]]:
-    lines: dict[Any, list[DirectActuator]] = {}
-    for actuator in actuators:
-        if actuator.has_delay:
-            own = None if actuator.shares_delay else id(actuator)
-            lines.setdefault((delay_settings(actuator), own), []).append(actuator)
-    return lines
 
 
 def _plan(actuators: Sequence[DirectActuator], device: str) -> list[_Route]:

@@ -15,7 +15,7 @@ from mjlab.actuator.pd_actuator import IdealPdActuator, IdealPdActuatorCfg, pd_t
 if TYPE_CHECKING:
     import mujoco
 
-    from mjlab.entity import Entity
+    from mjlab.entity.entity import Entity
 
 
 @dataclass(kw_only=True)
@@ -39,25 +39,6 @@ class DcMotorActuatorCfg(IdealPdActuatorCfg):
 
 
 DcMotorCfgT = TypeVar("DcMotorCfgT", bound=DcMotorActuatorCfg)
-
-
-def dc_motor_clip(
-    effort: torch.Tensor,
-    saturation_effort: torch.Tensor,
-    velocity_limit: torch.Tensor,
-    force_limit: torch.Tensor,
-    vel: torch.Tensor,
-) -> torch.Tensor:
-    """Return `effort` clamped to what a motor gives at speed `vel`; all (N, n).
-
-    With S = saturation_effort, w = velocity_limit, F = force_limit and v = vel, the bounds are
-    S (1 - v / w) above and S (-1 - v / w) below, both brought into [-F, F]. Faster than w the upper
-    bound is negative: the motor brakes.
-    """
-    speed = vel / velocity_limit
-    upper = torch.clamp(saturation_effort * (1.0 - speed), -force_limit, force_limit)
-    lower = torch.clamp(saturation_effort * (-1.0 - speed), -force_limit, force_limit)
-    return torch.clamp(effort, lower, upper)
 
 
 class DcMotorActuator(IdealPdActuator[DcMotorCfgT], Generic[DcMotorCfgT]):
@@ -104,3 +85,22 @@ class DcMotorActuator(IdealPdActuator[DcMotorCfgT], Generic[DcMotorCfgT]):
             params["force_limit"],
             cmd.vel,
         )
+
+
+def dc_motor_clip(
+    effort: torch.Tensor,
+    saturation_effort: torch.Tensor,
+    velocity_limit: torch.Tensor,
+    force_limit: torch.Tensor,
+    vel: torch.Tensor,
+) -> torch.Tensor:
+    """Return `effort` clamped to what a motor gives at speed `vel`; all (N, n).
+
+    With S = saturation_effort, w = velocity_limit, F = force_limit and v = vel, the bounds are
+    S (1 - v / w) above and S (-1 - v / w) below, both brought into [-F, F]. Faster than w the upper
+    bound is negative: the motor brakes.
+    """
+    speed = vel / velocity_limit
+    upper = torch.clamp(saturation_effort * (1.0 - speed), -force_limit, force_limit)
+    lower = torch.clamp(saturation_effort * (-1.0 - speed), -force_limit, force_limit)
+    return torch.clamp(effort, lower, upper)

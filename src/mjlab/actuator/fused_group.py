@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -20,54 +20,10 @@ from mjlab.actuator.actuator import (
 )
 from mjlab.actuator.pd_actuator import IdealPdActuator
 from mjlab.utils.buffers import DelayBuffer
-from mjlab.utils.indexing import (
-    Columns,
-    EnvIds,
-    as_columns,
-    write_columns,
-)
+from mjlab.utils.indexing import Columns, EnvIds, as_columns, write_columns
 
 if TYPE_CHECKING:
-    from mjlab.entity import EntityData
-
-
-@dataclass
-class _FusedGroup:
-    """Actuators of one class, transmission and delay, with their columns side by side."""
-
-    actuators: list[IdealPdActuator]
-    source: Columns = field(default_factory=lambda: slice(0))
-    ctrl: Columns = field(default_factory=lambda: slice(0))
-    params: dict[str, torch.Tensor] = field(default_factory=dict)
-    line: DelayBuffer | None = None
-
-    def initialize(self, num_envs: int, device: str) -> None:
-        # In the order of controls, so that they are neighbours wherever possible.
-        self.actuators.sort(key=lambda actuator: int(actuator.global_ctrl_ids.min()))
-        self.source = as_columns(_joined([a.target_ids for a in self.actuators]), device)
-        self.ctrl = as_columns(_joined([a.global_ctrl_ids for a in self.actuators]), device)
-        self.params = {
-            name: torch.cat([_parameter(a, name) for a in self.actuators], dim=1)
-            for name in self.actuators[0].param_names
-        }
-        widths = [len(actuator.target_ids) for actuator in self.actuators]
-        parts = {name: value.split(widths, dim=1) for name, value in self.params.items()}
-        for k, actuator in enumerate(self.actuators):
-            actuator.share_parameters({name: part[k] for name, part in parts.items()})
-        if self.actuators[0].has_delay:
-            self.line = share_line(self.actuators, num_envs, device)
-        else:
-            for actuator in self.actuators:
-                actuator.join_group(None, resets_delay=False)
-
-    def apply_controls(self, data: EntityData, env_ids: EnvIds) -> None:
-        first = self.actuators[0]
-        cmd = read_command(data, first.transmission_type, self.source)
-        if self.line is not None:
-            targets = (cmd.position_target, cmd.velocity_target, cmd.effort_target)
-            cmd = ActuatorCmd(*delay_rows(self.line, targets, env_ids), cmd.pos, cmd.vel)
-        ctrl = first.control_law(self.params, cmd)
-        write_columns(data.data.ctrl, self.ctrl, ctrl, env_ids)
+    from mjlab.entity.data import EntityData
 
 
 @dataclass
@@ -90,11 +46,15 @@ class FusedActuatorGroup:
         groups: dict[Any, _FusedGroup] = {}
         others = []
         for actuator in actuators:
-            if not _is_fusable(actuator):
+            if (
+                isinstance(actuator, IdealPdActuator)
+                and acts_like(actuator, IdealPdActuator)
+                and actuator.transmission_type != TransmissionType.SITE
+            ):
+                group = groups.setdefault(delay_settings(actuator), _FusedGroup([]))
+                group.actuators.append(actuator)
+            else:
                 others.append(actuator)
-                continue
-            group = groups.setdefault(delay_settings(actuator), _FusedGroup([]))
-            group.actuators.append(actuator)
         return FusedActuatorGroup(list(groups.values())), tuple(others)
 
     def initialize(self, num_envs: int, device: str) -> None:
@@ -111,19 +71,49 @@ class FusedActuatorGroup:
             group.apply_controls(data, env_ids)
 
 
-def _is_fusable(actuator: Actuator) -> TypeGuard[IdealPdActuator]:
-    return (
-        isinstance(actuator, IdealPdActuator)
-        and acts_like(actuator, IdealPdActuator)
-        and actuator.transmission_type != TransmissionType.SITE
-    )
+@dataclass
+class _FusedGroup:
+    """Actuators of one class, transmission and delay, with their columns side by side."""
 
+    actuators: list[IdealPdActuator]
+    source: Columns = field(default_factory=lambda: slice(0))
+    ctrl: Columns = field(default_factory=lambda: slice(0))
+    params: dict[str, torch.Tensor] = field(default_factory=dict)
+    line: DelayBuffer | None = None
 
-def _joined(ids: list[torch.Tensor]) -> list[int]:
-    return torch.cat(ids).tolist()
+    def initialize(self, num_envs: int, device: str) -> None:
+        # In the order of controls, so that they are neighbours wherever possible.
+        self.actuators.sort(key=lambda actuator: int(actuator.global_ctrl_ids.min()))
+        sources = torch.cat([actuator.target_ids for actuator in self.actuators])
+        ctrl_ids = torch.cat([actuator.global_ctrl_ids for actuator in self.actuators])
+        self.source = as_columns(sources.tolist(), device)
+        self.ctrl = as_columns(ctrl_ids.tolist(), device)
+        self.params = {
+            name: torch.cat([_parameter(actuator, name) for actuator in self.actuators], dim=1)
+            for name in self.actuators[0].param_names
+        }
+        widths = [len(actuator.target_ids) for actuator in self.actuators]
+        parts = {name: value.split(widths, dim=1) for name, value in self.params.items()}
+        for k, actuator in enumerate(self.actuators):
+            actuator.share_parameters({name: part[k] for name, part in parts.items()})
+        if self.actuators[0].has_delay:
+            self.line = share_line(self.actuators, num_envs, device)
+        else:
+            for actuator in self.actuators:
+                actuator.join_group(None, resets_delay=False)
+
+    def apply_controls(self, data: EntityData, env_ids: EnvIds) -> None:
+        first = self.actuators[0]
+        cmd = read_command(data, first.transmission_type, self.source)
+        if self.line is not None:
+            targets = (cmd.position_target, cmd.velocity_target, cmd.effort_target)
+            cmd = ActuatorCmd(*delay_rows(self.line, targets, env_ids), cmd.pos, cmd.vel)
+        ctrl = first.control_law(self.params, cmd)
+        write_columns(data.data.ctrl, self.ctrl, ctrl, env_ids)
 
 
 def _parameter(actuator: IdealPdActuator, name: str) -> torch.Tensor:
+    """Return a parameter; raise `ValueError` unless it is a tensor (N, n)."""
     value, shape = getattr(actuator, name, None), actuator.stiffness.shape
     if not isinstance(value, torch.Tensor) or value.shape != shape:
         found = tuple(value.shape) if isinstance(value, torch.Tensor) else repr(value)

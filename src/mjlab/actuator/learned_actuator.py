@@ -12,12 +12,13 @@ import torch
 from mjlab.actuator.actuator import ActuatorCmd
 from mjlab.actuator.dc_actuator import DcMotorActuator, DcMotorActuatorCfg, dc_motor_clip
 from mjlab.utils.buffers import CircularBuffer
+from mjlab.utils.errors import WrongStateError, check_count, check_one_of
 from mjlab.utils.indexing import EnvIds
 
 if TYPE_CHECKING:
     import mujoco
 
-    from mjlab.entity import Entity
+    from mjlab.entity.entity import Entity
 
 
 @dataclass(kw_only=True)
@@ -44,10 +45,8 @@ class LearnedMlpActuatorCfg(DcMotorActuatorCfg):
     def validate(self) -> None:
         """See `ActuatorCfg`."""
         super().validate()
-        if self.input_order not in ("pos_vel", "vel_pos"):
-            self._refuse("input_order", "choose pos_vel or vel_pos")
-        if self.history_length < 1:
-            self._refuse("history_length", "the network sees at least the current substep")
+        check_one_of(self._label("input_order"), self.input_order, ("pos_vel", "vel_pos"))
+        check_count(self._label("history_length"), self.history_length)
 
     def build(
         self, entity: Entity, target_ids: list[int], target_names: list[str]
@@ -92,7 +91,17 @@ class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
                 and return (N n, 1).
         """
         super().initialize(mj_model, model, data, device)
-        self._network = self._load_network(device)
+        try:
+            with warnings.catch_warnings():
+                # Torch would rather have other formats, but TorchScript is what these files are.
+                warnings.simplefilter("ignore", DeprecationWarning)
+                self._network = torch.jit.load(self.cfg.network_file, map_location=device).eval()
+        except RuntimeError as error:
+            raise ValueError(
+                f"{self.cfg.network_file!r} is no TorchScript file that can be loaded. Save the "
+                f"network with torch.jit.script(network).save(path). ({error})"
+            ) from error
+        self._check_network()
         num_envs, num_targets = self.stiffness.shape
         self._history = CircularBuffer(self.cfg.history_length, num_envs, device)
         # The first frame makes the buffer's memory; after the reset no environment has a history.
@@ -100,7 +109,6 @@ class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
             torch.zeros(num_envs, 2, num_targets, dtype=torch.float32, device=device)
         )
         self._history.reset()
-        self._try_network()
 
     def compute(self, cmd: ActuatorCmd) -> torch.Tensor:
         """Add the command and feedback to the histories and return the forces, (N, n)."""
@@ -120,7 +128,9 @@ class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
     @property
     def _buffer(self) -> CircularBuffer:
         if self._history is None:
-            raise RuntimeError(f"LearnedMlpActuator for {self._target_names} is not initialized.")
+            raise WrongStateError(
+                f"LearnedMlpActuator for {self._target_names} is not initialized."
+            )
         return self._history
 
     def _frame(self, cmd: ActuatorCmd) -> torch.Tensor:
@@ -144,37 +154,20 @@ class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
             force, self.saturation_effort, self.velocity_limit, self.force_limit, cmd.vel
         )
 
-    def _load_network(self, device: str) -> Any:
-        try:
-            with warnings.catch_warnings():
-                # Torch would rather have other formats, but TorchScript is what these files are.
-                warnings.simplefilter("ignore", DeprecationWarning)
-                network = torch.jit.load(self.cfg.network_file, map_location=device)
-        except RuntimeError as error:
-            raise ValueError(
-                f"{self.cfg.network_file!r} is no TorchScript file that can be loaded. Save the "
-                f"network with torch.jit.script(network).save(path). ({error})"
-            ) from error
-        return network.eval()
-
-    def _try_network(self) -> None:
+    def _check_network(self) -> None:
+        """Raise `ValueError` if the network does not take (N n, 2 H) inputs and return (N n, 1)."""
         num_rows, num_inputs = self.stiffness.numel(), 2 * self.cfg.history_length
         inputs = torch.zeros(
             num_rows, num_inputs, dtype=torch.float32, device=self.stiffness.device
         )
-        expected = (
-            f"({num_rows}, {num_inputs}) inputs (2 x history_length={self.cfg.history_length}, a "
-            f"row a joint) and return ({num_rows}, 1)"
+        message = (
+            f"The network {self.cfg.network_file!r} must take ({num_rows}, {num_inputs}) inputs (2 x "
+            f"history_length={self.cfg.history_length}, a row a joint) and return ({num_rows}, 1), but"
         )
         try:
             with torch.no_grad():
                 output = self._network(inputs)
         except RuntimeError as error:
-            raise ValueError(
-                f"The network {self.cfg.network_file!r} must take {expected}, but fails: {error}"
-            ) from error
+            raise ValueError(f"{message} fails: {error}") from error
         if output.shape != (num_rows, 1):
-            raise ValueError(
-                f"The network {self.cfg.network_file!r} must take {expected}, but returns "
-                f"{tuple(output.shape)}."
-            )
+            raise ValueError(f"{message} returns {tuple(output.shape)}.")

@@ -14,7 +14,7 @@ from mjlab.utils.indexing import EnvIds, as_ids
 from mjlab.utils.spec import create_motor_actuator
 
 if TYPE_CHECKING:
-    from mjlab.entity import Entity
+    from mjlab.entity.entity import Entity
 
 
 @dataclass(kw_only=True)
@@ -38,15 +38,6 @@ class IdealPdActuatorCfg(ActuatorCfg):
 
 
 IdealPdCfgT = TypeVar("IdealPdCfgT", bound=IdealPdActuatorCfg)
-
-
-def pd_torque(stiffness: torch.Tensor, damping: torch.Tensor, cmd: ActuatorCmd) -> torch.Tensor:
-    """Return kp (p* - l) + kd (v* - l') + f*, (N, n)."""
-    return (
-        stiffness * (cmd.position_target - cmd.pos)
-        + damping * (cmd.velocity_target - cmd.vel)
-        + cmd.effort_target
-    )
 
 
 class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
@@ -124,12 +115,9 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
             ("damping", self.cfg.damping),
             ("force_limit", self.cfg.effort_limit),
         ):
-            setattr(self, name, torch.full(shape, float(value), dtype=torch.float32, device=device))
-            setattr(
-                self,
-                f"default_{name}",
-                torch.full(shape, float(value), dtype=torch.float32, device=device),
-            )
+            for attribute in (name, f"default_{name}"):
+                full = torch.full(shape, float(value), dtype=torch.float32, device=device)
+                setattr(self, attribute, full)
 
     def compute(self, cmd: ActuatorCmd) -> torch.Tensor:
         """Return the forces, (N, n), by the class's control law."""
@@ -184,6 +172,15 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
             if not isinstance(values, SharedField):
                 ranges = torch.stack((-limit, limit), dim=-1).to(values.dtype)
                 values[rows[:, None], columns] = ranges
+
+
+def pd_torque(stiffness: torch.Tensor, damping: torch.Tensor, cmd: ActuatorCmd) -> torch.Tensor:
+    """Return kp (p* - l) + kd (v* - l') + f*, (N, n)."""
+    return (
+        stiffness * (cmd.position_target - cmd.pos)
+        + damping * (cmd.velocity_target - cmd.vel)
+        + cmd.effort_target
+    )
 
 
 def _per_target(value: torch.Tensor, shape: tuple[int, int], what: str) -> torch.Tensor:

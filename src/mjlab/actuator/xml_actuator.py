@@ -11,18 +11,11 @@ import mujoco
 
 from mjlab.actuator.actuator import ActuatorCfg, DirectActuator, TransmissionType
 from mjlab.compat import older_names
+from mjlab.utils.errors import WrongStateError, check_one_of
 from mjlab.utils.mujoco import CommandField, control_inputs, detect_command_field
 
 if TYPE_CHECKING:
-    from mjlab.entity import Entity
-
-__getattr__ = older_names(__name__)
-
-XML_TRANSMISSIONS = {
-    TransmissionType.JOINT: (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT),
-    TransmissionType.TENDON: (mujoco.mjtTrn.mjTRN_TENDON,),
-    TransmissionType.SITE: (mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtTrn.mjTRN_SLIDERCRANK),
-}
+    from mjlab.entity.entity import Entity
 
 
 @dataclass(kw_only=True)
@@ -36,8 +29,8 @@ class XmlActuatorCfg(ActuatorCfg):
     def validate(self) -> None:
         """See `ActuatorCfg`."""
         super().validate()
-        if self.command_field not in (None, "position", "velocity", "effort"):
-            self._refuse("command_field", "choose position, velocity, effort, or None to detect it")
+        fields = (None, "position", "velocity", "effort")
+        check_one_of(self._label("command_field"), self.command_field, fields)
 
     def build(self, entity: Entity, target_ids: list[int], target_names: list[str]) -> XmlActuator:
         """See `ActuatorCfg`."""
@@ -78,7 +71,7 @@ class XmlActuator(DirectActuator[XmlActuatorCfg]):
         Raises `RuntimeError` before `edit_spec`, unless the config states it.
         """
         if not self._command_fields:
-            raise RuntimeError(
+            raise WrongStateError(
                 f"The kind of the XML actuators on {self._target_names} is not known yet; it is "
                 "detected when the entity is built."
             )
@@ -91,10 +84,23 @@ class XmlActuator(DirectActuator[XmlActuatorCfg]):
             ValueError: no target has an actuator, the actuators are of several kinds, or
                 `command_field` contradicts what they are.
         """
-        found = self._find_elements(spec)
+        found: dict[str, mujoco.MjsActuator] = {}
+        for element in spec.actuators:
+            if element.trntype in XML_TRANSMISSIONS[self.transmission_type]:
+                found.setdefault(element.target, element)
         kept = [k for k, name in enumerate(target_names) if name in found]
         if not kept:
-            raise ValueError(self._nothing_found(spec, target_names))
+            existing = [
+                f"{element.name or '(unnamed)'} on "
+                f"{element.trntype.name.removeprefix('mjTRN_').lower()} {element.target!r}"
+                for element in spec.actuators
+            ]
+            raise ValueError(
+                f"XmlActuatorCfg for {self.cfg.target_names_expr} matches the "
+                f"{self.transmission_type.value}s {target_names}, but the XML has no actuator on any "
+                f"of them. It has: {existing or 'no actuators'}. Add one to the XML, or use a config "
+                "that makes actuators, such as BuiltinPositionActuatorCfg."
+            )
         self._mjs_actuators = [found[target_names[k]] for k in kept]
         self._command_fields = self._agreed_fields()
         unknown = [field for field in self._command_fields if field != "effort"]
@@ -110,15 +116,8 @@ class XmlActuator(DirectActuator[XmlActuatorCfg]):
         for k in kept:
             self._override_target(spec, target_names[k])
 
-    def _find_elements(self, spec: mujoco.MjSpec) -> dict[str, mujoco.MjsActuator]:
-        """Return the first actuator of each target with this transmission."""
-        found: dict[str, mujoco.MjsActuator] = {}
-        for element in spec.actuators:
-            if element.trntype in XML_TRANSMISSIONS[self.transmission_type]:
-                found.setdefault(element.target, element)
-        return found
-
     def _agreed_fields(self) -> tuple[CommandField, ...]:
+        """Return the commands that all elements read; raise if they or `command_field` disagree."""
         stated = self.cfg.command_field
         detected: dict[tuple[CommandField, ...], list[str]] = defaultdict(list)
         for element in self._mjs_actuators:
@@ -137,6 +136,7 @@ class XmlActuator(DirectActuator[XmlActuatorCfg]):
         return next(iter(detected))
 
     def _fields_of(self, element: mujoco.MjsActuator) -> tuple[CommandField, ...]:
+        """Return the commands that one element reads."""
         inputs = control_inputs(element)
         if inputs == (None,):
             # Detection does not know every kind; what the config states is trusted then.
@@ -151,15 +151,11 @@ class XmlActuator(DirectActuator[XmlActuatorCfg]):
             )
         return known
 
-    def _nothing_found(self, spec: mujoco.MjSpec, target_names: list[str]) -> str:
-        existing = [
-            f"{element.name or '(unnamed)'} on {element.trntype.name.removeprefix('mjTRN_').lower()}"
-            f" {element.target!r}"
-            for element in spec.actuators
-        ]
-        return (
-            f"XmlActuatorCfg for {self.cfg.target_names_expr} matches the "
-            f"{self.transmission_type.value}s {target_names}, but the XML has no actuator on any of "
-            f"them. It has: {existing or 'no actuators'}. Add one to the XML, or use a config "
-            "that makes actuators, such as BuiltinPositionActuatorCfg."
-        )
+
+XML_TRANSMISSIONS = {
+    TransmissionType.JOINT: (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT),
+    TransmissionType.TENDON: (mujoco.mjtTrn.mjTRN_TENDON,),
+    TransmissionType.SITE: (mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtTrn.mjTRN_SLIDERCRANK),
+}
+
+__getattr__ = older_names(__name__)

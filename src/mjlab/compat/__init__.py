@@ -307,7 +307,9 @@ def older_names(module_name: str) -> Callable[[str], Any]:
         if name not in table:
             raise AttributeError(f"module {module_name!r} has no attribute {name!r}")
         value = _load(table[name])
-        message = f"{module_name}.{name} is an older name; today it is {_dotted(table[name])}."
+        message = (
+            f"{module_name}.{name} is an older name; today it is {table[name].replace(':', '.')}."
+        )
         if table[name].startswith(f"{_OLDER}:"):
             message = f"{module_name}.{name} is an older name, and is removed in mjlab 2.0."
         if inspect.isfunction(value):
@@ -336,7 +338,7 @@ def offers_older_static_methods(cls: C) -> C:
 
 def _calling(older_name: str, path: str) -> Callable[..., Any]:
     def older(*args: Any, **kwargs: Any) -> Any:
-        _warn_once(f"{older_name} is an older name; today it is {_dotted(path)}.")
+        _warn_once(f"{older_name} is an older name; today it is {path.replace(':', '.')}.")
         return _load(path)(*args, **kwargs)
 
     return older
@@ -549,10 +551,6 @@ def _load(path: str) -> Any:
     """Import and return the object at "module:name"."""
     home, _, name = path.partition(":")
     return getattr(importlib.import_module(home), name)
-
-
-def _dotted(path: str) -> str:
-    return path.replace(":", ".")
 
 
 def set_array_field(field: Any, values: Any) -> None:

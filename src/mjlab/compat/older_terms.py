@@ -30,8 +30,10 @@ from mjlab.utils.state import capture_state, restore_state
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 
+
 _ROBOT = SceneEntityCfg("robot")
 _PHYSICS = ("qpos", "qvel", "mocap_pos", "mocap_quat")
+_HEIGHT_SENSOR = "foot_height_scan"
 
 
 def update_command(method: Callable[..., Any], term: Any, *args: Any, **kwargs: Any) -> Any:
@@ -224,6 +226,13 @@ class feet_swing_height(feet_rewards.feet_swing_height):
         return "the selection of sites", site_columns(env, params["asset_cfg"])
 
 
+def offer_sites(template: ManagerBasedRlEnvCfg) -> None:
+    """Let packages set sites of feet in the velocity template, as those of 1.1 and 1.2 do."""
+    for term in _height_terms(template):
+        term.params = _FeetParams(term.params)
+        term.params.template = template
+
+
 class _FeetParams(dict[str, Any]):
     """Parameters of a template's term that reads `asset_cfg` where today there is a height sensor.
 
@@ -235,7 +244,11 @@ class _FeetParams(dict[str, Any]):
     def __missing__(self, key: str) -> Any:
         if key != "asset_cfg" or self.template is None:
             raise KeyError(key)
-        _remove_height_sensor(self.template)
+        for term in _height_terms(self.template):
+            for name in [name for name, value in term.params.items() if value == _HEIGHT_SENSOR]:
+                del term.params[name]
+        scene = self.template.scene
+        scene.sensors = tuple(cfg for cfg in scene.sensors if cfg.name != _HEIGHT_SENSOR)
         self[key] = SceneEntityCfg("robot", site_names=())
         return self[key]
 
@@ -246,26 +259,8 @@ class _FeetParams(dict[str, Any]):
         return copied
 
 
-_HEIGHT_SENSOR = "foot_height_scan"
-
-
-def offer_sites(template: ManagerBasedRlEnvCfg) -> None:
-    """Let packages set sites of feet in the velocity template, as those of 1.1 and 1.2 do."""
-    for term in _height_terms(template):
-        term.params = _FeetParams(term.params)
-        term.params.template = template
-
-
 def _height_terms(template: ManagerBasedRlEnvCfg) -> list[Any]:
     terms: list[Any] = list(template.rewards.values())
     for group in template.observations.values():
         terms += group.terms.values() if group else ()
     return [term for term in terms if term and _HEIGHT_SENSOR in term.params.values()]
-
-
-def _remove_height_sensor(template: ManagerBasedRlEnvCfg) -> None:
-    for term in _height_terms(template):
-        for key in [key for key, value in term.params.items() if value == _HEIGHT_SENSOR]:
-            del term.params[key]
-    sensors = template.scene.sensors
-    template.scene.sensors = tuple(cfg for cfg in sensors if cfg.name != _HEIGHT_SENSOR)

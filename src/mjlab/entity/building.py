@@ -1,404 +1,138 @@
-"""TODO."""
+"""From an entity's config to its spec: joints, actuators, initial state, simulation options.
+
+Everything here works on specs and values; `Entity` calls it in the order of this file.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
 
-from mjlab.actuator import TransmissionType, XmlActuatorCfg
-from mjlab.actuator.xml_actuator import XML_TRANSMISSIONS
+from mjlab.actuator.actuator import Actuator, ActuatorCfg, TransmissionType
+from mjlab.actuator.xml_actuator import XML_TRANSMISSIONS, XmlActuatorCfg
+from mjlab.utils.lab_api.string import resolve_matching_names
 from mjlab.utils.mujoco import control_inputs, qpos_width
 from mjlab.utils.string import resolve_expr
 
-if TYPE_CHECKING:
-    from mjlab.actuator import Actuator, ActuatorCfg
-    from mjlab.entity.entity import Entity, EntityCfg
-
-
-# MERGED mjlab.entity.building: The state an entity starts from: resolving the config, and the keyframe that shows it.
-
 KEY_NAME = "init_state"
-
-
-@dataclass(frozen=True)
-class XmlKey:
-    """The first keyframe of an entity's XML."""
-
-    name: str
-    qpos: tuple[float, ...]
-    ctrl: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class InitialState:
-    """The configured initial state, resolved for one entity's joints and actuators."""
-
-    root_state: tuple[float, ...]
-    """Position, quaternion, linear and angular velocity; only the pose with a fixed base."""
-    joint_pos: tuple[float, ...]
-    joint_vel: tuple[float, ...]
-    qpos: dict[mujoco.MjsJoint, tuple[float, ...]]
-    """The values of each joint, the free one included, in spec order."""
-    ctrl: dict[mujoco.MjsActuator, tuple[float, ...]]
-    """The controls of each actuator, in spec order."""
-
-
-def take_keys(spec: mujoco.MjSpec) -> XmlKey | None:
-    """Return the first keyframe of `spec`, and delete all of them.
-
-    A keyframe holds the whole of `qpos` and `ctrl`, so one made for the XML alone does not fit
-    once actuators are added. The scene gets a keyframe made from the resolved initial state.
-    """
-    keys = list(spec.keys)
-    if not keys:
-        return None
-    first = XmlKey(keys[0].name, tuple(keys[0].qpos), tuple(keys[0].ctrl))
-    if len(keys) > 1:
-        warnings.warn(
-            f"The spec {spec.modelname!r} has {len(keys)} keyframes: "
-            f"{[key.name for key in keys]}. Only the first is used, and only where "
-            "init_state.joint_pos is None; the others are dropped.",
-            UserWarning,
-            stacklevel=2,
-        )
-    for key in keys:
-        spec.delete(key)
-    return first
-
-
-def resolve_initial_state(
-    cfg: EntityCfg,
-    spec: mujoco.MjSpec,
-    free_joint: mujoco.MjsJoint | None,
-    joints: tuple[mujoco.MjsJoint, ...],
-    xml_key: XmlKey | None,
-) -> InitialState:
-    """Resolve `cfg.init_state` for the joints and actuators of `spec`.
-
-    Raises:
-        ValueError: a vector has the wrong length; `joint_pos` is None and the XML has no keyframe
-            that fits.
-    """
-    init = cfg.init_state
-    names = tuple(short_name(joint.name) for joint in joints)
-    pose = (*_vector(init.pos, 3, "pos"), *_vector(init.rot, 4, "rot"))
-    velocity = (*_vector(init.lin_vel, 3, "lin_vel"), *_vector(init.ang_vel, 3, "ang_vel"))
-    joint_vel = _floats(resolve_expr(init.joint_vel, names, 0.0))
-    if init.joint_pos is None:
-        joint_pos = _joint_pos_of_key(xml_key, spec, joints)
-    else:
-        joint_pos = _floats(resolve_expr(init.joint_pos, names, 0.0))
-    values: dict[mujoco.MjsJoint, tuple[float, ...]] = {
-        joint: (value,) for joint, value in zip(joints, joint_pos, strict=True)
-    }
-    if free_joint is not None:
-        values[free_joint] = pose
-    return InitialState(
-        root_state=pose if free_joint is None else (*pose, *velocity),
-        joint_pos=joint_pos,
-        joint_vel=joint_vel,
-        qpos={joint: values[joint] for joint in spec.joints},
-        ctrl=_ctrl(spec, joints, joint_pos, xml_key if init.joint_pos is None else None),
-    )
-
-
-def add_key(spec: mujoco.MjSpec, states: list[InitialState]) -> None:
-    """Add the keyframe `init_state` to `spec`, which holds the elements of `states`.
-
-    Joints and actuators that belong to no entity take the model's own reference and zero.
-    """
-    known_joints = {joint: v for state in states for joint, v in state.qpos.items()}
-    known_ctrl = {actuator: u for state in states for actuator, u in state.ctrl.items()}
-    qpos: list[float] = []
-    for joint in spec.joints:
-        values = known_joints.get(joint)
-        qpos.extend(_reference(joint) if values is None else values)
-    ctrl = [
-        value
-        for actuator in spec.actuators
-        for value in known_ctrl.get(actuator) or (0.0,) * len(control_inputs(actuator))
-    ]
-    spec.add_key(name=KEY_NAME, qpos=qpos, ctrl=ctrl)
-
-
-def short_name(name: str) -> str:
-    """Return the part of an element's name after the last '/', which is its name in its entity.
-
-    Names that merged variants give to geoms are kept whole: their last part is but a number.
-    """
-    _, merged, rest = name.partition("mjlab/pad/")
-    return merged + rest if merged else name.rsplit("/", 1)[-1]
-
-
-def _reference(joint: mujoco.MjsJoint) -> list[float]:
-    """Return what the compiler puts into `qpos0` for a joint."""
-    if joint.type == mujoco.mjtJoint.mjJNT_FREE:
-        return [*joint.parent.pos, *joint.parent.quat]
-    if joint.type == mujoco.mjtJoint.mjJNT_BALL:
-        return [1.0, 0.0, 0.0, 0.0]
-    in_degrees = joint.type == mujoco.mjtJoint.mjJNT_HINGE and joint.compiler.degree
-    return [math.radians(joint.ref) if in_degrees else float(joint.ref)]
-
-
-def _ctrl(
-    spec: mujoco.MjSpec,
-    joints: tuple[mujoco.MjsJoint, ...],
-    joint_pos: tuple[float, ...],
-    key: XmlKey | None,
-) -> dict[mujoco.MjsActuator, tuple[float, ...]]:
-    """Return the controls that hold the joints at `joint_pos`, or those of a keyframe."""
-    positions = {joint.name: value for joint, value in zip(joints, joint_pos, strict=True)}
-    known = key.ctrl if key is not None else ()
-    ctrl, start = {}, 0
-    for actuator in spec.actuators:
-        inputs = control_inputs(actuator)
-        stop = start + len(inputs)
-        # The actuators that the XML itself has come first, in the order of its keyframe.
-        if stop <= len(known):
-            ctrl[actuator] = tuple(map(float, known[start:stop]))
-        else:
-            # A joint position is no sensible force, speed or activation.
-            on_joint = actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT
-            held = positions.get(actuator.target, 0.0) if on_joint else 0.0
-            ctrl[actuator] = tuple(held if what == "position" else 0.0 for what in inputs)
-        start = stop
-    return ctrl
-
-
-def _joint_pos_of_key(
-    key: XmlKey | None, spec: mujoco.MjSpec, joints: tuple[mujoco.MjsJoint, ...]
-) -> tuple[float, ...]:
-    if key is None:
-        raise ValueError(
-            "init_state.joint_pos is None, which takes the joint positions from the first "
-            f"keyframe of the XML, but the spec {spec.modelname!r} has no keyframe. Add one, or "
-            "give joint_pos as a dict of joint name pattern to position."
-        )
-    expected = sum(qpos_width(joint.type) for joint in spec.joints)
-    if len(key.qpos) != expected:
-        raise ValueError(
-            "init_state.joint_pos is None, which takes the joint positions from the keyframe "
-            f"{key.name!r}, but that has {len(key.qpos)} values in qpos and the spec "
-            f"{spec.modelname!r} needs {expected}."
-        )
-    start, values = 0, {}
-    for joint in spec.joints:
-        values[joint] = key.qpos[start]
-        start += qpos_width(joint.type)
-    return _floats(values[joint] for joint in joints)
-
-
-def _floats(values: Iterable[float]) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)
-
-
-def _vector(values: tuple[float, ...], length: int, what: str) -> tuple[float, ...]:
-    if len(values) != length:
-        raise ValueError(
-            f"init_state.{what} has {len(values)} values ({tuple(values)}); it needs {length}."
-        )
-    return _floats(values)
-
-
-# MERGED mjlab.entity.building: Resolving actuator configs to an entity's joints, tendons and sites.
-
-_ORDER = {TransmissionType.JOINT: 0, TransmissionType.TENDON: 1, TransmissionType.SITE: 2}
-
-
-def build_actuators(entity: Entity) -> list[Actuator]:
-    """Build the configured actuators and add their elements to the entity's spec.
-
-    Elements come config by config, or, with `sort_actuators`, in the order of what they act on
-    (joints, then tendons, then sites), after those that the XML already has.
-
-    Raises:
-        ValueError: the patterns of a config do not resolve, with the reason and the candidates; or
-            what they match has an actuator already, of another config, or of the XML with the name
-            that the new one gets. Other actuators of the XML stay, with a warning: both act.
-    """
-    articulation = entity.cfg.articulation
-    if articulation is None:
-        return []
-    built = []
-    for cfg in articulation.actuators:
-        ids, names = _find_targets(entity, cfg)
-        built.append((cfg.build(entity, ids, names), ids))
-    _check_second_actuators(entity, built)
-    if entity.cfg.sort_actuators:
-        _add_sorted(entity, built)
-    else:
-        # Those that wrap the XML's actuators come first, before there are others to find. They
-        # add nothing.
-        for actuator, ids in sorted(built, key=lambda pair: not _wraps_xml(pair[0])):
-            _add(entity, actuator, ids)
-    return [actuator for actuator, _ in built]
-
-
-def _wraps_xml(actuator: Actuator) -> bool:
-    return isinstance(actuator.cfg, XmlActuatorCfg)
-
-
-def _check_second_actuators(entity: Entity, built: list[tuple[Actuator, list[int]]]) -> None:
-    """Warn if a config adds an actuator to a target that has one of the XML: their forces add up.
-
-    Raises:
-        ValueError: two configs act on one target, or the actuators would have the same name.
-    """
-    in_xml: dict[tuple[TransmissionType, str], list[str]] = {}
-    for element in entity.spec.actuators:
-        for transmission, kinds in XML_TRANSMISSIONS.items():
-            if element.trntype in kinds:
-                in_xml.setdefault((transmission, element.target), []).append(element.name)
-    names_in_xml = {element.name for element in entity.spec.actuators}
-    claimed: dict[tuple[bool, TransmissionType, str], str] = {}
-    for actuator, ids in built:
-        cfg, kind = actuator.cfg, actuator.transmission_type
-        wraps = _wraps_xml(actuator)
-        label = f"{type(cfg).__name__}({cfg.target_names_expr!r})"
-        names = [_elements(entity, kind)[index].name for index in ids]
-        # One that wraps those of the XML leaves out what has none.
-        names = [name for name in names if (kind, name) in in_xml or not wraps]
-        taken = {
-            n: f"one by {claimed[wraps, kind, n]}" for n in names if (wraps, kind, n) in claimed
-        }
-        beside = {
-            name: " and ".join(
-                f"the actuator {other or '(unnamed)'!r} of the XML" for other in in_xml[kind, name]
-            )
-            for name in names
-            if not wraps and (kind, name) in in_xml
-        }
-        taken |= {name: by for name, by in beside.items() if name in in_xml[kind, name]}
-        message = f"{label} acts on {kind.value}s that have an actuator already: "
-        if taken:
-            raise ValueError(
-                f"{message}{_list_taken(taken)}. Give each one actuator: narrow the patterns, remove "
-                "the actuator from the XML, or use it as it is there, by XmlActuatorCfg alone."
-            )
-        # New actuators are named as what they act on.
-        same = [short_name(name) for name in names if not wraps and name in names_in_xml]
-        if same:
-            raise ValueError(
-                f"{label} adds actuators to the {kind.value}s {same}, and names them so; the XML has "
-                "actuators of these names on other targets. Rename or remove those in the XML."
-            )
-        if beside:
-            warnings.warn(
-                f"{message}{_list_taken(beside)}. Both act, and their forces add up. If that is not "
-                "meant, remove the actuator from the XML.",
-                UserWarning,
-                stacklevel=2,
-            )
-        claimed |= dict.fromkeys(((wraps, kind, name) for name in names), label)
-
-
-def _list_taken(taken: dict[str, str]) -> str:
-    return ", ".join(f"{short_name(name)!r} has {by}" for name, by in taken.items())
-
-
-def _add(entity: Entity, actuator: Actuator, ids: list[int]) -> None:
-    # An entity's own names leave out the prefixes of specs that it was put together from, but
-    # elements of the spec refer to each other by full names.
-    elements = _elements(entity, actuator.transmission_type)
-    actuator.edit_spec(entity.spec, [elements[index].name for index in ids])
-
-
-def _add_sorted(entity: Entity, built: list[tuple[Actuator, list[int]]]) -> None:
-    pairs = []
-    for position, (actuator, ids) in enumerate(built):
-        if _wraps_xml(actuator):
-            _add(entity, actuator, ids)
-        else:
-            order = _ORDER[actuator.transmission_type]
-            pairs.extend((order, index, position, actuator) for index in ids)
-    for _, index, _, actuator in sorted(pairs, key=lambda pair: pair[:3]):
-        _add(entity, actuator, [index])
-
-
-def _elements(entity: Entity, transmission: TransmissionType) -> Sequence[Any]:
-    if transmission == TransmissionType.JOINT:
-        return entity.joints
-    return entity.spec.tendons if transmission == TransmissionType.TENDON else entity.spec.sites
-
-
-def _namespace(entity: Entity, transmission: TransmissionType) -> tuple[str, ...]:
-    return tuple(short_name(element.name) for element in _elements(entity, transmission))
-
-
-def _find_targets(entity: Entity, cfg: ActuatorCfg) -> tuple[list[int], list[str]]:
-    patterns, kind = cfg.target_names_expr, cfg.transmission_type
-    find = {
-        TransmissionType.JOINT: entity.find_joints,
-        TransmissionType.TENDON: entity.find_tendons,
-        TransmissionType.SITE: entity.find_sites,
-    }[kind]
-    try:
-        ids, names = find(patterns)
-    except ValueError as error:
-        raise ValueError(
-            f"{type(cfg).__name__}(target_names_expr={patterns!r}, transmission_type="
-            f"{kind.value!r}): {error}{_elsewhere(entity, cfg)}"
-        ) from None
-    if not names:
-        raise ValueError(
-            f"{type(cfg).__name__}(target_names_expr={patterns!r}) names no {kind.value}. "
-            f"Available: {list(_namespace(entity, kind))}."
-        )
-    if "" in names:
-        raise ValueError(
-            f"{type(cfg).__name__}(target_names_expr={patterns!r}) matches a {kind.value} without "
-            "a name, which no actuator can refer to. Name it in the XML."
-        )
-    _warn_if_ambiguous(entity, cfg)
-    return ids, names
-
-
-def _elsewhere(entity: Entity, cfg: ActuatorCfg) -> str:
-    """Say where else the patterns match, for somebody who forgot the transmission type."""
-    hints = []
-    for other in _others(cfg):
-        found = [n for n in _namespace(entity, other) if _any_match(cfg.target_names_expr, n)]
-        if found:
-            hints.append(
-                f"{other.value}s {found} (transmission_type=TransmissionType.{other.name})"
-            )
-    return f"\nThe patterns do match: {'; '.join(hints)}." if hints else ""
-
-
-def _warn_if_ambiguous(entity: Entity, cfg: ActuatorCfg) -> None:
-    patterns = cfg.target_names_expr
-    for other in _others(cfg):
-        names = _namespace(entity, other)
-        if all(any(re.fullmatch(pattern, name) for name in names) for pattern in patterns):
-            found = [name for name in names if _any_match(patterns, name)]
-            warnings.warn(
-                f"{type(cfg).__name__}(target_names_expr={patterns!r}) acts on "
-                f"{cfg.transmission_type.value}s, but its patterns also match the {other.value}s "
-                f"{found}. Make the patterns unambiguous, or set transmission_type.",
-                UserWarning,
-                stacklevel=2,
-            )
-
-
-def _others(cfg: ActuatorCfg) -> list[TransmissionType]:
-    return [kind for kind in TransmissionType if kind != cfg.transmission_type]
-
-
-def _any_match(patterns: tuple[str, ...], name: str) -> bool:
-    return any(re.fullmatch(pattern, name) for pattern in patterns)
-
-
-# MERGED mjlab.entity.building: What an entity's spec is made of: which joints it has, and where its root is.
+BIT_FIELDS = ("disableflags", "enableflags", "disableactuator")
+"""Options that are sets of independent switches, one a bit."""
 
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _BALL = mujoco.mjtJoint.mjJNT_BALL
+
+# The order of MuJoCo's MJOPTION_FIELDS (mjxmacro.h), which is that of the bits in
+# `spec.authored.option`: they tell a value that was written out from one that was left open.
+_AUTHORED_ORDER = (
+    "timestep",
+    "impratio",
+    "tolerance",
+    "ls_tolerance",
+    "noslip_tolerance",
+    "ccd_tolerance",
+    "sleep_tolerance",
+    "gravity",
+    "wind",
+    "magnetic",
+    "density",
+    "viscosity",
+    "o_margin",
+    "o_solref",
+    "o_solimp",
+    "o_friction",
+    "integrator",
+    "cone",
+    "jacobian",
+    "solver",
+    "iterations",
+    "ls_iterations",
+    "noslip_iterations",
+    "ccd_iterations",
+    "disableflags",
+    "enableflags",
+    "disableactuator",
+    "sdf_initpoints",
+    "sdf_iterations",
+)
+
+
+def copy_spec(made: Any, function: str) -> mujoco.MjSpec:
+    """Return a copy of what a user's function made; raise `ValueError` if it is not a spec.
+
+    Editors change it, a scene takes it in, and a function might return one spec twice.
+    """
+    if not isinstance(made, mujoco.MjSpec):
+        raise ValueError(
+            f"{function} returned {type(made).__name__}; it must return a mujoco.MjSpec, such as "
+            "mujoco.MjSpec.from_file(path)."
+        )
+    return made.copy()
+
+
+# Simulation options. A scene has one `<option>`. Attaching a spec to the scene drops the `<option>`
+# of that spec, so what an entity asks for is taken out before, and the scene decides what becomes of
+# it.
+
+
+@dataclass(frozen=True)
+class EntityOptions:
+    """Options that a spec states: written out in its XML, or different from MuJoCo's defaults."""
+
+    values: dict[str, Any] = field(default_factory=dict)
+    """Option field to value: a number, or a tuple for vectors."""
+    switches: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """For each of `BIT_FIELDS`: (bits that are set, bits about which the spec says anything)."""
+
+
+def pop_options(spec: mujoco.MjSpec) -> EntityOptions:
+    """Return the options that `spec` states, and put its `<option>` back to MuJoCo's defaults.
+
+    Without the second, MuJoCo would warn at every attachment about values that are not lost.
+    """
+    options, default = stated_options(spec), mujoco.MjSpec().option
+    for name in _AUTHORED_ORDER:
+        write_option(spec.option, name, getattr(default, name))
+    spec.authored.option = 0
+    for name in BIT_FIELDS:
+        setattr(spec.authored, name, 0)
+    return options
+
+
+def stated_options(spec: mujoco.MjSpec) -> EntityOptions:
+    """Return the options that `spec` states."""
+    default = mujoco.MjSpec().option
+    values = {}
+    for position, name in enumerate(_AUTHORED_ORDER):
+        value = getattr(spec.option, name)
+        is_default = np.array_equal(value, getattr(default, name))
+        if name not in BIT_FIELDS and (spec.authored.option >> position & 1 or not is_default):
+            values[name] = tuple(value.tolist()) if isinstance(value, np.ndarray) else value
+    switches = {}
+    for name in BIT_FIELDS:
+        bits = int(getattr(spec.option, name))
+        stated = bits | int(getattr(spec.authored, name))
+        if stated:
+            switches[name] = (bits, stated)
+    return EntityOptions(values, switches)
+
+
+def write_option(option: Any, name: str, value: Any) -> None:
+    """Set a field of a MuJoCo option block, element by element where it is a vector."""
+    current = getattr(option, name)
+    if isinstance(current, np.ndarray):
+        current[:] = value
+    else:
+        setattr(option, name, value)
+
+
+# Joints and root body.
 
 
 def find_joints(
@@ -443,102 +177,368 @@ def place_body(body: mujoco.MjsBody, pose: tuple[float, ...]) -> None:
     body.quat[:] = pose[3:7]
 
 
-# MERGED mjlab.entity.building: The simulation options that an entity's own XML asks for.
-#
-# A scene has one `<option>`. Attaching a spec to the scene drops the `<option>` of that spec, so what
-# an entity asks for is taken out before, and the scene decides what becomes of it.
+def short_name(name: str) -> str:
+    """Return the part of an element's name after the last '/', which is its name in its entity.
+
+    Names that merged variants give to geoms are kept whole: their last part is but a number.
+    """
+    _, merged, rest = name.partition("mjlab/pad/")
+    return merged + rest if merged else name.rsplit("/", 1)[-1]
 
 
-# The order of MuJoCo's MJOPTION_FIELDS (mjxmacro.h), which is that of the bits in
-# `spec.authored.option`: they tell a value that was written out from one that was left open.
-_AUTHORED_ORDER = (
-    "timestep",
-    "impratio",
-    "tolerance",
-    "ls_tolerance",
-    "noslip_tolerance",
-    "ccd_tolerance",
-    "sleep_tolerance",
-    "gravity",
-    "wind",
-    "magnetic",
-    "density",
-    "viscosity",
-    "o_margin",
-    "o_solref",
-    "o_solimp",
-    "o_friction",
-    "integrator",
-    "cone",
-    "jacobian",
-    "solver",
-    "iterations",
-    "ls_iterations",
-    "noslip_iterations",
-    "ccd_iterations",
-    "disableflags",
-    "enableflags",
-    "disableactuator",
-    "sdf_initpoints",
-    "sdf_iterations",
-)
-BIT_FIELDS = ("disableflags", "enableflags", "disableactuator")
-"""Options that are sets of independent switches, one a bit."""
+def short_names(elements: Iterable[Any]) -> tuple[str, ...]:
+    """Return the names of spec elements in their entity."""
+    return tuple(short_name(element.name) for element in elements)
+
+
+Found = tuple[list[int], list[str]]
+"""Ids within an entity, and names."""
+
+
+def find_names(
+    kind: str,
+    name_keys: str | Sequence[str],
+    names: Sequence[str],
+    subset: Sequence[str] | None = None,
+    preserve_order: bool = False,
+) -> Found:
+    """Find names by regular expressions; errors name the `kind` of elements. See `Entity`."""
+    try:
+        return resolve_matching_names(
+            name_keys, names if subset is None else subset, preserve_order
+        )
+    except ValueError as error:
+        raise ValueError(f"Cannot find {kind} by {name_keys!r}. {error}") from None
+
+
+# Actuators.
+
+
+def build_actuators(
+    cfgs: Sequence[ActuatorCfg],
+    spec: mujoco.MjSpec,
+    joints: Sequence[mujoco.MjsJoint],
+    build: Callable[[ActuatorCfg, list[int], list[str]], Actuator],
+    sort: bool,
+) -> list[Actuator]:
+    """Build the configured actuators and add their elements to an entity's spec.
+
+    Elements come config by config, or, with `sort`, in the order of what they act on (joints, then
+    tendons, then sites), after those that the XML already has.
+
+    Args:
+        cfgs: Configs of the actuators.
+        spec: The entity's spec.
+        joints: The joints of the entity, without a free joint.
+        build: Returns the actuator of a config, given ids and names of its targets in the entity.
+        sort: Sort the elements.
+
+    Raises:
+        ValueError: the patterns of a config do not resolve, with the reason and the candidates; or
+            what they match has an actuator already, of another config, or of the XML with the name
+            that the new one gets. Other actuators of the XML stay, with a warning: both act.
+    """
+    elements = {
+        TransmissionType.JOINT: joints,
+        TransmissionType.TENDON: spec.tendons,
+        TransmissionType.SITE: spec.sites,
+    }
+    # An entity's own names leave out the prefixes of specs that it was put together from, but
+    # elements of the spec refer to each other by full names.
+    full_names = {kind: [element.name for element in own] for kind, own in elements.items()}
+    names = {kind: short_names(own) for kind, own in elements.items()}
+    built = []
+    for cfg in cfgs:
+        ids, found = _find_targets(cfg, names)
+        built.append((build(cfg, ids, found), [full_names[cfg.transmission_type][i] for i in ids]))
+    _check_second_actuators(spec, built)
+    # Those that wrap the XML's actuators add nothing, and look for them before there are others.
+    ordered = [pair for pair in built if isinstance(pair[0].cfg, XmlActuatorCfg)]
+    added = [pair for pair in built if not isinstance(pair[0].cfg, XmlActuatorCfg)]
+    if sort:
+        order = [(kind, name) for kind, own in full_names.items() for name in own]
+        single = [(actuator, [name]) for actuator, own in added for name in own]
+        added = sorted(single, key=lambda pair: order.index((pair[0].transmission_type, *pair[1])))
+    for actuator, targets in ordered + added:
+        actuator.edit_spec(spec, targets)
+    return [actuator for actuator, _ in built]
+
+
+def _find_targets(
+    cfg: ActuatorCfg, names: dict[TransmissionType, tuple[str, ...]]
+) -> tuple[list[int], list[str]]:
+    """Return ids and names of a config's targets; warn if other kinds of elements match too."""
+    patterns, kind = cfg.target_names_expr, cfg.transmission_type
+    label = (
+        f"{type(cfg).__name__}(target_names_expr={patterns!r}, transmission_type={kind.value!r})"
+    )
+    try:
+        ids, found = resolve_matching_names(patterns, names[kind])
+    except ValueError as error:
+        hints = [
+            f"{other.value}s {also} (transmission_type=TransmissionType.{other.name})"
+            for other, also in _matches_elsewhere(cfg, names).items()
+        ]
+        hint = f"\nThe patterns do match: {'; '.join(hints)}." if hints else ""
+        raise ValueError(f"{label}: {error}{hint}") from None
+    if not found:
+        raise ValueError(f"{label} names no {kind.value}. Available: {list(names[kind])}.")
+    if "" in found:
+        raise ValueError(
+            f"{label} matches a {kind.value} without a name, which no actuator can refer to. Name it "
+            "in the XML."
+        )
+    for other, also in _matches_elsewhere(cfg, names).items():
+        if all(any(re.fullmatch(pattern, name) for name in also) for pattern in patterns):
+            warnings.warn(
+                f"{label} acts on {kind.value}s, but its patterns also match the {other.value}s "
+                f"{also}. Make the patterns unambiguous, or set transmission_type.",
+                UserWarning,
+                stacklevel=2,
+            )
+    return ids, found
+
+
+def _matches_elsewhere(
+    cfg: ActuatorCfg, names: dict[TransmissionType, tuple[str, ...]]
+) -> dict[TransmissionType, list[str]]:
+    """Return the elements of other kinds that a config's patterns match."""
+    found = {
+        kind: [name for name in own if any(re.fullmatch(p, name) for p in cfg.target_names_expr)]
+        for kind, own in names.items()
+        if kind != cfg.transmission_type
+    }
+    return {kind: own for kind, own in found.items() if own}
+
+
+def _check_second_actuators(spec: mujoco.MjSpec, built: list[tuple[Actuator, list[str]]]) -> None:
+    """Warn if a config adds an actuator to a target that has one of the XML: their forces add up.
+
+    Raises:
+        ValueError: two configs act on one target, or the actuators would have the same name.
+    """
+    in_xml: dict[tuple[TransmissionType, str], list[str]] = {}
+    for element in spec.actuators:
+        for transmission, kinds in XML_TRANSMISSIONS.items():
+            if element.trntype in kinds:
+                in_xml.setdefault((transmission, element.target), []).append(element.name)
+    names_in_xml = {element.name for element in spec.actuators}
+    claimed: dict[tuple[bool, TransmissionType, str], str] = {}
+    for actuator, targets in built:
+        cfg, kind = actuator.cfg, actuator.transmission_type
+        wraps = isinstance(cfg, XmlActuatorCfg)
+        label = f"{type(cfg).__name__}({cfg.target_names_expr!r})"
+        # One that wraps those of the XML leaves out what has none.
+        names = [name for name in targets if (kind, name) in in_xml or not wraps]
+        taken = {
+            n: f"one by {claimed[wraps, kind, n]}" for n in names if (wraps, kind, n) in claimed
+        }
+        beside = {
+            name: " and ".join(
+                f"the actuator {other or '(unnamed)'!r} of the XML" for other in in_xml[kind, name]
+            )
+            for name in names
+            if not wraps and (kind, name) in in_xml
+        }
+        taken |= {name: by for name, by in beside.items() if name in in_xml[kind, name]}
+        message = f"{label} acts on {kind.value}s that have an actuator already: "
+        if taken:
+            raise ValueError(
+                f"{message}{_list_taken(taken)}. Give each one actuator: narrow the patterns, remove "
+                "the actuator from the XML, or use it as it is there, by XmlActuatorCfg alone."
+            )
+        # New actuators are named as what they act on.
+        same = [short_name(name) for name in names if not wraps and name in names_in_xml]
+        if same:
+            raise ValueError(
+                f"{label} adds actuators to the {kind.value}s {same}, and names them so; the XML has "
+                "actuators of these names on other targets. Rename or remove those in the XML."
+            )
+        if beside:
+            warnings.warn(
+                f"{message}{_list_taken(beside)}. Both act, and their forces add up. If that is not "
+                "meant, remove the actuator from the XML.",
+                UserWarning,
+                stacklevel=2,
+            )
+        claimed |= dict.fromkeys(((wraps, kind, name) for name in names), label)
+
+
+def _list_taken(taken: dict[str, str]) -> str:
+    """Return "'hip' has one by X, 'knee' has one by Y"."""
+    return ", ".join(f"{short_name(name)!r} has {by}" for name, by in taken.items())
+
+
+# Initial state.
 
 
 @dataclass(frozen=True)
-class EntityOptions:
-    """Options that a spec states: written out in its XML, or different from MuJoCo's defaults."""
+class XmlKey:
+    """The first keyframe of an entity's XML."""
 
-    values: dict[str, Any] = field(default_factory=dict)
-    """Option field to value: a number, or a tuple for vectors."""
-    switches: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """For each of `BIT_FIELDS`: (bits that are set, bits about which the spec says anything)."""
-
-
-def stated_options(spec: mujoco.MjSpec) -> EntityOptions:
-    """Return the options that `spec` states."""
-    default = mujoco.MjSpec().option
-    values = {
-        name: _plain(getattr(spec.option, name))
-        for position, name in enumerate(_AUTHORED_ORDER)
-        if name not in BIT_FIELDS
-        and (
-            spec.authored.option >> position & 1
-            or not np.array_equal(getattr(spec.option, name), getattr(default, name))
-        )
-    }
-    switches = {}
-    for name in BIT_FIELDS:
-        bits = int(getattr(spec.option, name))
-        stated = bits | int(getattr(spec.authored, name))
-        if stated:
-            switches[name] = (bits, stated)
-    return EntityOptions(values, switches)
+    name: str
+    qpos: tuple[float, ...]
+    ctrl: tuple[float, ...]
 
 
-def take_options(spec: mujoco.MjSpec) -> EntityOptions:
-    """Return the options that `spec` states, and put its `<option>` back to MuJoCo's defaults.
+@dataclass(frozen=True)
+class InitialState:
+    """The configured initial state, resolved for one entity's joints and actuators."""
 
-    Without the second, MuJoCo would warn at every attachment about values that are not lost.
+    root_state: tuple[float, ...]
+    """Position, quaternion, linear and angular velocity; only the pose with a fixed base."""
+    joint_pos: tuple[float, ...]
+    joint_vel: tuple[float, ...]
+    qpos: dict[mujoco.MjsJoint, tuple[float, ...]]
+    """The values of each joint, the free one included, in spec order."""
+    ctrl: dict[mujoco.MjsActuator, tuple[float, ...]]
+    """The controls of each actuator, in spec order."""
+
+
+def pop_keyframes(spec: mujoco.MjSpec) -> XmlKey | None:
+    """Return the first keyframe of `spec`, and delete all of them.
+
+    A keyframe holds the whole of `qpos` and `ctrl`, so one made for the XML alone does not fit
+    once actuators are added. The scene gets a keyframe made from the resolved initial state.
     """
-    options, default = stated_options(spec), mujoco.MjSpec().option
-    for name in _AUTHORED_ORDER:
-        write_option(spec.option, name, getattr(default, name))
-    spec.authored.option = 0
-    for name in BIT_FIELDS:
-        setattr(spec.authored, name, 0)
-    return options
+    keys = list(spec.keys)
+    if not keys:
+        return None
+    first = XmlKey(keys[0].name, tuple(keys[0].qpos), tuple(keys[0].ctrl))
+    if len(keys) > 1:
+        warnings.warn(
+            f"The spec {spec.modelname!r} has {len(keys)} keyframes: "
+            f"{[key.name for key in keys]}. Only the first is used, and only where "
+            "init_state.joint_pos is None; the others are dropped.",
+            UserWarning,
+            stacklevel=2,
+        )
+    for key in keys:
+        spec.delete(key)
+    return first
 
 
-def write_option(option: Any, name: str, value: Any) -> None:
-    """Set a field of a MuJoCo option block, element by element where it is a vector."""
-    current = getattr(option, name)
-    if isinstance(current, np.ndarray):
-        current[:] = value
+def resolve_initial_state(
+    spec: mujoco.MjSpec,
+    free_joint: mujoco.MjsJoint | None,
+    joints: tuple[mujoco.MjsJoint, ...],
+    xml_key: XmlKey | None,
+    *,
+    pos: tuple[float, ...],
+    rot: tuple[float, ...],
+    lin_vel: tuple[float, ...],
+    ang_vel: tuple[float, ...],
+    joint_pos: dict[str, float] | None,
+    joint_vel: dict[str, float],
+) -> InitialState:
+    """Resolve the fields of an `InitialStateCfg` for the joints and actuators of `spec`.
+
+    Raises:
+        ValueError: a vector has the wrong length; `joint_pos` is None and the XML has no keyframe
+            that fits.
+    """
+    pose = (*_vector(pos, 3, "pos"), *_vector(rot, 4, "rot"))
+    velocity = (*_vector(lin_vel, 3, "lin_vel"), *_vector(ang_vel, 3, "ang_vel"))
+    names = short_names(joints)
+    if joint_pos is None:
+        positions = _joint_pos_of_key(xml_key, spec, joints)
     else:
-        setattr(option, name, value)
+        positions = _floats(resolve_expr(joint_pos, names, 0.0))
+    values = {joint: (value,) for joint, value in zip(joints, positions, strict=True)}
+    return InitialState(
+        root_state=pose if free_joint is None else (*pose, *velocity),
+        joint_pos=positions,
+        joint_vel=_floats(resolve_expr(joint_vel, names, 0.0)),
+        qpos={joint: values.get(joint, pose) for joint in spec.joints},
+        ctrl=_initial_ctrl(spec, joints, positions, xml_key if joint_pos is None else None),
+    )
 
 
-def _plain(value: Any) -> Any:
-    return tuple(value.tolist()) if isinstance(value, np.ndarray) else value
+def add_key(spec: mujoco.MjSpec, states: list[InitialState]) -> None:
+    """Add the keyframe `init_state` to `spec`, which holds the elements of `states`.
+
+    Joints and actuators that belong to no entity take the model's own reference and zero.
+    """
+    known_joints = {joint: v for state in states for joint, v in state.qpos.items()}
+    known_ctrl = {actuator: u for state in states for actuator, u in state.ctrl.items()}
+    qpos: list[float] = []
+    for joint in spec.joints:
+        values = known_joints.get(joint)
+        qpos.extend(_reference(joint) if values is None else values)
+    ctrl = [
+        value
+        for actuator in spec.actuators
+        for value in known_ctrl.get(actuator) or (0.0,) * len(control_inputs(actuator))
+    ]
+    spec.add_key(name=KEY_NAME, qpos=qpos, ctrl=ctrl)
+
+
+def _joint_pos_of_key(
+    key: XmlKey | None, spec: mujoco.MjSpec, joints: tuple[mujoco.MjsJoint, ...]
+) -> tuple[float, ...]:
+    """Return the joint positions of the keyframe; raise `ValueError` if it does not fit."""
+    if key is None:
+        raise ValueError(
+            "init_state.joint_pos is None, which takes the joint positions from the first "
+            f"keyframe of the XML, but the spec {spec.modelname!r} has no keyframe. Add one, or "
+            "give joint_pos as a dict of joint name pattern to position."
+        )
+    expected = sum(qpos_width(joint.type) for joint in spec.joints)
+    if len(key.qpos) != expected:
+        raise ValueError(
+            "init_state.joint_pos is None, which takes the joint positions from the keyframe "
+            f"{key.name!r}, but that has {len(key.qpos)} values in qpos and the spec "
+            f"{spec.modelname!r} needs {expected}."
+        )
+    start, values = 0, {}
+    for joint in spec.joints:
+        values[joint] = key.qpos[start]
+        start += qpos_width(joint.type)
+    return _floats(values[joint] for joint in joints)
+
+
+def _initial_ctrl(
+    spec: mujoco.MjSpec,
+    joints: tuple[mujoco.MjsJoint, ...],
+    joint_pos: tuple[float, ...],
+    key: XmlKey | None,
+) -> dict[mujoco.MjsActuator, tuple[float, ...]]:
+    """Return the controls that hold the joints at `joint_pos`, or those of a keyframe."""
+    positions = {joint.name: value for joint, value in zip(joints, joint_pos, strict=True)}
+    known = key.ctrl if key is not None else ()
+    ctrl, start = {}, 0
+    for actuator in spec.actuators:
+        inputs = control_inputs(actuator)
+        stop = start + len(inputs)
+        # The actuators that the XML itself has come first, in the order of its keyframe.
+        if stop <= len(known):
+            ctrl[actuator] = tuple(map(float, known[start:stop]))
+        else:
+            # A joint position is no sensible force, speed or activation.
+            on_joint = actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT
+            held = positions.get(actuator.target, 0.0) if on_joint else 0.0
+            ctrl[actuator] = tuple(held if kind == "position" else 0.0 for kind in inputs)
+        start = stop
+    return ctrl
+
+
+def _reference(joint: mujoco.MjsJoint) -> list[float]:
+    """Return what the compiler puts into `qpos0` for a joint."""
+    if joint.type == mujoco.mjtJoint.mjJNT_FREE:
+        return [*joint.parent.pos, *joint.parent.quat]
+    if joint.type == mujoco.mjtJoint.mjJNT_BALL:
+        return [1.0, 0.0, 0.0, 0.0]
+    in_degrees = joint.type == mujoco.mjtJoint.mjJNT_HINGE and joint.compiler.degree
+    return [math.radians(joint.ref) if in_degrees else float(joint.ref)]
+
+
+def _vector(values: tuple[float, ...], length: int, name: str) -> tuple[float, ...]:
+    if len(values) != length:
+        raise ValueError(
+            f"init_state.{name} has {len(values)} values ({tuple(values)}); it needs {length}."
+        )
+    return _floats(values)
+
+
+def _floats(values: Iterable[float]) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)

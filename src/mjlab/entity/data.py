@@ -4,62 +4,105 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
 from mjlab.compat import offers_older_attributes, older_names
 from mjlab.entity.indexing import Addresses, EntityIndexing, Ids
-from mjlab.utils.indexing import EnvIds, as_ids
+from mjlab.utils.errors import UnsupportedError
+from mjlab.utils.indexing import EnvIds, as_ids, as_index
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse, quat_from_matrix, quat_mul
 from mjlab.utils.state import stateful
 
-if TYPE_CHECKING:
-    from mjlab.entity.indexing import EntityIndexing
 
+@offers_older_attributes
+@stateful
+@dataclass(eq=False)
+class EntityData:
+    """State and targets of one entity. N environments, nb bodies, nj joints, and so on.
 
-# MERGED mjlab.entity.data: Poses and velocities of one entity's root, bodies, geoms and sites.
+    World frame unless a name ends in `_b` (frame of the root link); quaternions are (w, x, y, z);
+    SI units, radians; velocities of links and of centres of mass are (linear, angular).
 
+    A property computes only itself, when it is read. Where the entity's elements follow each other
+    in the simulation, `joint_pos`, `body_link_pos_w` and other plain fields are **views of the
+    simulation**: they change as it advances, so clone what has to last.
 
-def compute_velocity_from_cvel(
-    pos: torch.Tensor, subtree_com: torch.Tensor, cvel: torch.Tensor
-) -> torch.Tensor:
-    """Return the world velocity of points fixed to bodies: (..., 6) linear, angular.
+    After `sim.step()` joint positions and velocities are current, and everything that MuJoCo
+    derives from them (poses, velocities of links, forces, accelerations) belongs to the state
+    before the last substep, until `sim.forward()`. In observations poses and velocities are
+    current; forces and accelerations are those of the last substep (`ManagerBasedRlEnv.step`).
 
-    MuJoCo's `cvel = (omega, v_c)` is the velocity of the point of the (extended) body that is now
-    at `c`, the centre of mass of the body's whole tree. Hence `v(p) = v_c - omega x (c - p)`.
+    Writers: `env_ids` is None (all), a slice, a boolean mask or a one-dimensional tensor of indices;
+    element ids, which count within the entity, may also be a list. Tensors of both select their
+    product. Values are tensors or arrays of any float type; the simulation holds float32.
 
-    Args:
-        pos: (..., 3) world positions p.
-        subtree_com: (..., 3) centre of mass of the tree that each point's body belongs to.
-        cvel: (..., 6) `cvel` of each point's body.
+    Writes go straight to the simulation. What derives from the state (`body_link_pos_w`, velocities
+    of links, sensors, ...) keeps its old values until the next `sim.forward()`. Environments whose
+    poses or joint positions were written are noted in `moved_envs`: forces of the last substep do
+    not belong to them any more, so `env.step` and `env.reset` recompute these.
     """
-    linear = _linear_velocity(pos, subtree_com, cvel)
-    return torch.cat((linear, cvel[..., :3].expand_as(linear)), dim=-1)
 
+    _transient = {
+        "indexing", "data", "model", "device", "_views", "gravity_vec_w", "forward_vec_b",
+        "moved_envs",
+    }  # fmt: skip
 
-def _linear_velocity(
-    pos: torch.Tensor, subtree_com: torch.Tensor, cvel: torch.Tensor
-) -> torch.Tensor:
-    return torch.linalg.cross(cvel[..., :3], pos - subtree_com).add_(cvel[..., 3:])
-
-
-class KinematicsReader:
-    """The properties of `EntityData` that read where things are and how they move.
-
-    `EntityData` says what they have in common.
-    """
+    POS_DIM = 3
+    QUAT_DIM = 4
+    LIN_VEL_DIM = 3
+    ANG_VEL_DIM = 3
+    ROOT_POSE_DIM = POS_DIM + QUAT_DIM
+    ROOT_VEL_DIM = LIN_VEL_DIM + ANG_VEL_DIM
+    ROOT_STATE_DIM = ROOT_POSE_DIM + ROOT_VEL_DIM
 
     indexing: EntityIndexing
+    """Where the entity's elements are in the model."""
     data: Any
+    """The simulation's data fields."""
     model: Any
+    """The simulation's model fields."""
     device: str
+    default_root_state: torch.Tensor
+    """(N, 13) configured position, quaternion, linear and angular velocity, without environment
+    origins; (N, 7) with a fixed base."""
+    default_joint_pos: torch.Tensor
+    """(N, nj) configured joint positions."""
+    default_joint_vel: torch.Tensor
+    """(N, nj) configured joint velocities."""
+    default_joint_pos_limits: torch.Tensor
+    """(N, nj, 2) limits of the compiled model; infinite where a joint has none."""
+    joint_pos_limits: torch.Tensor
+    """(N, nj, 2) limits in use. Changing `jnt_range` afterwards does not change them."""
+    soft_joint_pos_limits: torch.Tensor
+    """(N, nj, 2) limits shrunk about their middle by the configured factor."""
     gravity_vec_w: torch.Tensor
+    """(N, 3) unit vector down, (0, 0, -1); not the model's gravity."""
     forward_vec_b: torch.Tensor
-    _views: dict[Any, torch.Tensor]
+    """(N, 3) forward direction of the root link, (1, 0, 0)."""
+    is_fixed_base: bool
+    is_articulated: bool
+    is_actuated: bool
+    joint_pos_target: torch.Tensor
+    joint_vel_target: torch.Tensor
+    joint_effort_target: torch.Tensor
+    """(N, nj) commands for joint actuators; zero after a reset."""
+    tendon_len_target: torch.Tensor
+    tendon_vel_target: torch.Tensor
+    tendon_effort_target: torch.Tensor
+    """(N, number of tendons) commands for tendon actuators; (N, 0) without such actuators."""
+    site_effort_target: torch.Tensor
+    """(N, number of sites) commands for site actuators; (N, 0) without such actuators."""
+    encoder_bias: torch.Tensor
+    """(N, nj) added to joint positions in `joint_pos_biased`; kept over resets."""
+    moved_envs: torch.Tensor | None = None
+    """(N,) bool, where a pose or joint positions were written since the last substep; None for
+    nowhere."""
+    _views: dict[Any, torch.Tensor] = field(default_factory=dict, repr=False)
 
-    def _find_addresses(self) -> None:
+    def __post_init__(self) -> None:
         ix, device = self.indexing, self.device
         self._joint_q = Addresses(ix.joint_q_adr, device)
         self._joint_v = Addresses(ix.joint_v_adr, device)
@@ -79,38 +122,6 @@ class KinematicsReader:
         start_q, start_v = ix.free_joint_q_adr[:1].tolist(), ix.free_joint_v_adr[:1].tolist()
         self._free_q = slice(start_q[0], start_q[0] + 7) if start_q else slice(0, 0)
         self._free_v = slice(start_v[0], start_v[0] + 6) if start_v else slice(0, 0)
-
-    # Reading a simulation field.
-
-    def _columns(self, name: str, at: Addresses) -> torch.Tensor:
-        """Return the entity's part of a data field: a view, kept, where addresses allow one."""
-        key = (name, id(at))
-        view = self._views.get(key)
-        if view is not None:
-            return view
-        field = getattr(self.data, name)
-        if isinstance(at.all, torch.Tensor):
-            # Several times as fast as indexing with the tensor.
-            return field.index_select(1, at.all)
-        # Tensors of data fields live as long as the simulation, so views of them do too.
-        view = self._views[key] = field[:, at.all]
-        return view
-
-    def _root_row(self, name: str) -> torch.Tensor:
-        key = (name, "root")
-        view = self._views.get(key)
-        if view is None:
-            view = self._views[key] = getattr(self.data, name)[:, self.indexing.root_body_id]
-        return view
-
-    def _tree_com(self, trees: Addresses) -> torch.Tensor:
-        """Return centres of mass of trees, (N, n, 3), or (N, 1, 3) if all are the root's tree.
-
-        An entity with several top-level bodies has several trees, each with its own centre.
-        """
-        if trees.constant == self.indexing.root_body_id:
-            return self._columns("subtree_com", self._root)
-        return self._columns("subtree_com", trees)
 
     # Root link.
 
@@ -385,83 +396,96 @@ class KinematicsReader:
         """(N, number of sites, 6) velocities of the sites."""
         return torch.cat((self.site_lin_vel_w, self.site_ang_vel_w), dim=-1)
 
+    # Joints, tendons, actuators.
 
-# MERGED mjlab.entity.data: Writing the state of one entity into the simulation.
+    @property
+    def joint_pos(self) -> torch.Tensor:
+        """(N, nj) joint positions."""
+        return self._columns("qpos", self._joint_q)
 
+    @property
+    def joint_pos_biased(self) -> torch.Tensor:
+        """(N, nj) joint positions as encoders with a bias report them."""
+        return self.joint_pos + self.encoder_bias
 
-def assign(
-    field: torch.Tensor,
-    value: torch.Tensor,
-    env_ids: EnvIds,
-    columns: slice | torch.Tensor | int,
-) -> None:
-    """Write `value` into rows `env_ids` and `columns` of `field`; tensors select their product."""
-    if env_ids is None:
-        field[:, columns] = value
-    elif isinstance(columns, torch.Tensor) and not isinstance(env_ids, slice):
-        field[as_ids(env_ids, len(field), field.device)[:, None], columns] = value
-    else:
-        field[env_ids, columns] = value
+    @property
+    def joint_vel(self) -> torch.Tensor:
+        """(N, nj) joint velocities."""
+        return self._columns("qvel", self._joint_v)
 
+    @property
+    def joint_acc(self) -> torch.Tensor:
+        """(N, nj) joint accelerations, of the last substep."""
+        return self._columns("qacc", self._joint_v)
 
-def rows(field: torch.Tensor, env_ids: EnvIds) -> torch.Tensor:
-    """Return the rows `env_ids` of `field`."""
-    return field if env_ids is None else field[env_ids]
-
-
-def as_values(
-    value: Any, width: int, name: str, device: str, broadcasts: bool = False
-) -> torch.Tensor:
-    """Return a tensor, array or number as float32, whose last dimension must be `width`.
-
-    With `broadcasts` it may be 1: one value for all elements.
-
-    Raises:
-        ValueError: the width is another.
-    """
-    if not isinstance(value, torch.Tensor):
-        # Copied, because torch warns about arrays that it may not write to.
-        value = torch.as_tensor(np.array(value), dtype=torch.float32, device=device)
-    elif value.dtype != torch.float32:
-        value = value.to(device, torch.float32)
-    widths = (1, width) if broadcasts else (width,)
-    if value.ndim > 0 and value.shape[-1] not in widths:
-        raise ValueError(
-            f"{name} has {value.shape[-1]} values per environment (shape {tuple(value.shape)}), "
-            f"but {width} are to be written. Give a tensor of shape (number of envs, {width})."
+    @property
+    def joint_torques(self) -> torch.Tensor:
+        """Not offered: see the error for the two things it could mean."""
+        raise UnsupportedError(
+            "joint_torques could mean two things. Use qfrc_actuator for what the actuators apply "
+            "to the joints, or actuator_force for the force of each actuator before its gear."
         )
-    return value
 
+    @property
+    def tendon_len(self) -> torch.Tensor:
+        """(N, number of tendons) tendon lengths."""
+        return self._columns("ten_length", self._tendons)
 
-class StateWriter:
-    """The writers of `EntityData`.
+    @property
+    def tendon_vel(self) -> torch.Tensor:
+        """(N, number of tendons) tendon velocities."""
+        return self._columns("ten_velocity", self._tendons)
 
-    `env_ids` is None (all), a slice, a boolean mask or a one-dimensional tensor of indices; element
-    ids, which count within the entity, may also be a list. Tensors of both select their product.
-    Values are tensors or arrays of any float type; the simulation holds float32.
+    @property
+    def actuator_force(self) -> torch.Tensor:
+        """(N, number of forces) forces of the actuators in turn, before their gear.
 
-    Writes go straight to the simulation. What derives from the state (`body_link_pos_w`, velocities
-    of links, sensors, ...) keeps its old values until the next `sim.forward()`.
+        Those of the last substep. An orientation servo has three, every other actuator one; see
+        `indexing.force_columns`.
+        """
+        return self._columns("actuator_force", self._forces)
 
-    Environments whose poses or joint positions were written are noted in `moved_envs`: forces of the
-    last substep do not belong to them any more, so `env.step` and `env.reset` recompute these.
-    """
+    @property
+    def qfrc_actuator(self) -> torch.Tensor:
+        """(N, nj) generalized forces of the actuators on the joints in the last substep."""
+        return self._columns("qfrc_actuator", self._joint_v)
 
-    indexing: EntityIndexing
-    data: Any
-    model: Any
-    device: str
-    default_root_state: torch.Tensor
-    moved_envs: torch.Tensor | None
-    is_fixed_base: bool
-    is_articulated: bool
-    is_actuated: bool
-    _joint_q: Addresses
-    _joint_v: Addresses
-    _bodies: Addresses
-    _ctrl: Addresses
-    _free_q: slice
-    _free_v: slice
+    @property
+    def qfrc_external(self) -> torch.Tensor:
+        """(N, nj) generalized forces on the joints of the wrenches now applied to bodies.
+
+        `sum_b S_j . (tau_b + (p_b - c) x f_b, f_b)` over the bodies b that joint axis j moves, with
+        its motion axis `S_j` (`cdof`) about c, the centre of mass of the tree.
+        """
+        # Not `qfrc_smooth` without its other parts: those are of different stages of MuJoCo.
+        force, torque = self._columns("xfrc_applied", self._bodies).split(3, dim=-1)
+        arm = self._columns("xipos", self._bodies) - self._tree_com(self._body_trees)
+        wrench = torch.cat((torque + torch.linalg.cross(arm, force), force), dim=-1)
+        # A sum, because products of matrices may be rounded to TF32.
+        below = (self.indexing.moved_bodies[..., None] * wrench[:, None]).sum(dim=2)
+        return (self._columns("cdof", self._joint_v) * below).sum(dim=-1)
+
+    # Targets.
+
+    def clear_state(self, env_ids: EnvIds = None) -> None:
+        """Set all targets to zero."""
+        for target in (
+            self.joint_pos_target,
+            self.joint_vel_target,
+            self.joint_effort_target,
+            self.tendon_len_target,
+            self.tendon_vel_target,
+            self.tendon_effort_target,
+            self.site_effort_target,
+        ):
+            if target.shape[1] == 0:
+                continue
+            if env_ids is None:
+                target.zero_()
+            else:
+                target[env_ids] = 0.0
+
+    # Writing into the simulation.
 
     def write_root_state(self, root_state: torch.Tensor, env_ids: EnvIds = None) -> None:
         """Write pose and velocity of the root link, (k, 13): see the next two writers."""
@@ -515,7 +539,7 @@ class StateWriter:
             ValueError: the entity has a fixed base, or the width is wrong.
         """
         quat, linear, angular = self._read_velocity("write_root_com_velocity", velocity, env_ids)
-        offset_b = rows(self.model.body_ipos[:, self.indexing.root_body_id], env_ids)
+        offset_b = self.model.body_ipos[:, self.indexing.root_body_id][as_index(env_ids)]
         linear = linear - torch.linalg.cross(angular, quat_apply(quat, offset_b))
         self.write_root_velocity(torch.cat((linear, angular), dim=-1), env_ids)
 
@@ -618,7 +642,7 @@ class StateWriter:
             moved = torch.zeros(size, dtype=torch.bool, device=self.device)
         else:
             moved = self.moved_envs.clone()
-        moved[slice(None) if env_ids is None else env_ids] = True
+        moved[as_index(env_ids)] = True
         self.moved_envs = moved
 
     def _read_velocity(
@@ -630,7 +654,7 @@ class StateWriter:
         """
         self._require_floating(what)
         velocity = as_values(velocity, 6, "The root velocity", self.device)
-        quat = rows(self.data.qpos[:, self._free_q], env_ids)[:, 3:7]
+        quat = self.data.qpos[:, self._free_q][as_index(env_ids), 3:7]
         halves = velocity.expand(len(quat), 6)
         return quat, halves[:, :3], halves[:, 3:]
 
@@ -645,175 +669,99 @@ class StateWriter:
         if not self.is_articulated:
             raise ValueError(f"{what}: this entity has no joints other than a free one.")
 
+    # Reading a simulation field.
 
-@offers_older_attributes
-@stateful
-@dataclass(eq=False)
-class EntityData(KinematicsReader, StateWriter):
-    """State and targets of one entity. N environments, nb bodies, nj joints, and so on.
+    def _columns(self, name: str, at: Addresses) -> torch.Tensor:
+        """Return the entity's part of a data field: a view, kept, where addresses allow one."""
+        key = (name, id(at))
+        view = self._views.get(key)
+        if view is not None:
+            return view
+        field = getattr(self.data, name)
+        if isinstance(at.all, torch.Tensor):
+            # Several times as fast as indexing with the tensor.
+            return field.index_select(1, at.all)
+        # Tensors of data fields live as long as the simulation, so views of them do too.
+        view = self._views[key] = field[:, at.all]
+        return view
 
-    World frame unless a name ends in `_b` (frame of the root link); quaternions are (w, x, y, z);
-    SI units, radians; velocities of links and of centres of mass are (linear, angular).
+    def _root_row(self, name: str) -> torch.Tensor:
+        key = (name, "root")
+        view = self._views.get(key)
+        if view is None:
+            view = self._views[key] = getattr(self.data, name)[:, self.indexing.root_body_id]
+        return view
 
-    A property computes only itself, when it is read. Where the entity's elements follow each other
-    in the simulation, `joint_pos`, `body_link_pos_w` and other plain fields are **views of the
-    simulation**: they change as it advances, so clone what has to last.
+    def _tree_com(self, trees: Addresses) -> torch.Tensor:
+        """Return centres of mass of trees, (N, n, 3), or (N, 1, 3) if all are the root's tree.
 
-    After `sim.step()` joint positions and velocities are current, and everything that MuJoCo
-    derives from them (poses, velocities of links, forces, accelerations) belongs to the state
-    before the last substep, until `sim.forward()`. In observations poses and velocities are
-    current; forces and accelerations are those of the last substep (`ManagerBasedRlEnv.step`).
+        An entity with several top-level bodies has several trees, each with its own centre.
+        """
+        if trees.constant == self.indexing.root_body_id:
+            return self._columns("subtree_com", self._root)
+        return self._columns("subtree_com", trees)
+
+
+def compute_velocity_from_cvel(
+    pos: torch.Tensor, subtree_com: torch.Tensor, cvel: torch.Tensor
+) -> torch.Tensor:
+    """Return the world velocity of points fixed to bodies: (..., 6) linear, angular.
+
+    MuJoCo's `cvel = (omega, v_c)` is the velocity of the point of the (extended) body that is now
+    at `c`, the centre of mass of the body's whole tree. Hence `v(p) = v_c - omega x (c - p)`.
+
+    Args:
+        pos: (..., 3) world positions p.
+        subtree_com: (..., 3) centre of mass of the tree that each point's body belongs to.
+        cvel: (..., 6) `cvel` of each point's body.
     """
+    linear = _linear_velocity(pos, subtree_com, cvel)
+    return torch.cat((linear, cvel[..., :3].expand_as(linear)), dim=-1)
 
-    _transient = {
-        "indexing", "data", "model", "device", "_views", "gravity_vec_w", "forward_vec_b",
-        "moved_envs",
-    }  # fmt: skip
 
-    POS_DIM = 3
-    QUAT_DIM = 4
-    LIN_VEL_DIM = 3
-    ANG_VEL_DIM = 3
-    ROOT_POSE_DIM = POS_DIM + QUAT_DIM
-    ROOT_VEL_DIM = LIN_VEL_DIM + ANG_VEL_DIM
-    ROOT_STATE_DIM = ROOT_POSE_DIM + ROOT_VEL_DIM
+def _linear_velocity(
+    pos: torch.Tensor, subtree_com: torch.Tensor, cvel: torch.Tensor
+) -> torch.Tensor:
+    return torch.linalg.cross(cvel[..., :3], pos - subtree_com).add_(cvel[..., 3:])
 
-    indexing: EntityIndexing
-    """Where the entity's elements are in the model."""
-    data: Any
-    """The simulation's data fields."""
-    model: Any
-    """The simulation's model fields."""
-    device: str
-    default_root_state: torch.Tensor
-    """(N, 13) configured position, quaternion, linear and angular velocity, without environment
-    origins; (N, 7) with a fixed base."""
-    default_joint_pos: torch.Tensor
-    """(N, nj) configured joint positions."""
-    default_joint_vel: torch.Tensor
-    """(N, nj) configured joint velocities."""
-    default_joint_pos_limits: torch.Tensor
-    """(N, nj, 2) limits of the compiled model; infinite where a joint has none."""
-    joint_pos_limits: torch.Tensor
-    """(N, nj, 2) limits in use. Changing `jnt_range` afterwards does not change them."""
-    soft_joint_pos_limits: torch.Tensor
-    """(N, nj, 2) limits shrunk about their middle by the configured factor."""
-    gravity_vec_w: torch.Tensor
-    """(N, 3) unit vector down, (0, 0, -1); not the model's gravity."""
-    forward_vec_b: torch.Tensor
-    """(N, 3) forward direction of the root link, (1, 0, 0)."""
-    is_fixed_base: bool
-    is_articulated: bool
-    is_actuated: bool
-    joint_pos_target: torch.Tensor
-    joint_vel_target: torch.Tensor
-    joint_effort_target: torch.Tensor
-    """(N, nj) commands for joint actuators; zero after a reset."""
-    tendon_len_target: torch.Tensor
-    tendon_vel_target: torch.Tensor
-    tendon_effort_target: torch.Tensor
-    """(N, number of tendons) commands for tendon actuators; (N, 0) without such actuators."""
-    site_effort_target: torch.Tensor
-    """(N, number of sites) commands for site actuators; (N, 0) without such actuators."""
-    encoder_bias: torch.Tensor
-    """(N, nj) added to joint positions in `joint_pos_biased`; kept over resets."""
-    moved_envs: torch.Tensor | None = None
-    """(N,) bool, where a pose or joint positions were written since the last substep; None for
-    nowhere."""
-    _views: dict[Any, torch.Tensor] = field(default_factory=dict, repr=False)
 
-    def __post_init__(self) -> None:
-        self._find_addresses()
+def as_values(
+    value: Any, width: int, name: str, device: str, broadcasts: bool = False
+) -> torch.Tensor:
+    """Return a tensor, array or number as float32, whose last dimension must be `width`.
 
-    def clear_state(self, env_ids: EnvIds = None) -> None:
-        """Set all targets to zero."""
-        for target in self._targets():
-            if target.shape[1] == 0:
-                continue
-            if env_ids is None:
-                target.zero_()
-            else:
-                target[env_ids] = 0.0
+    With `broadcasts` it may be 1: one value for all elements.
 
-    def _targets(self) -> tuple[torch.Tensor, ...]:
-        return (
-            self.joint_pos_target,
-            self.joint_vel_target,
-            self.joint_effort_target,
-            self.tendon_len_target,
-            self.tendon_vel_target,
-            self.tendon_effort_target,
-            self.site_effort_target,
+    Raises:
+        ValueError: the width is another.
+    """
+    if not isinstance(value, torch.Tensor):
+        # Copied, because torch warns about arrays that it may not write to.
+        value = torch.as_tensor(np.array(value), dtype=torch.float32, device=device)
+    elif value.dtype != torch.float32:
+        value = value.to(device, torch.float32)
+    widths = (1, width) if broadcasts else (width,)
+    if value.ndim > 0 and value.shape[-1] not in widths:
+        raise ValueError(
+            f"{name} has {value.shape[-1]} values per environment (shape {tuple(value.shape)}), "
+            f"but {width} are to be written. Give a tensor of shape (number of envs, {width})."
         )
+    return value
 
-    # Joints, tendons, actuators.
 
-    @property
-    def joint_pos(self) -> torch.Tensor:
-        """(N, nj) joint positions."""
-        return self._columns("qpos", self._joint_q)
-
-    @property
-    def joint_pos_biased(self) -> torch.Tensor:
-        """(N, nj) joint positions as encoders with a bias report them."""
-        return self.joint_pos + self.encoder_bias
-
-    @property
-    def joint_vel(self) -> torch.Tensor:
-        """(N, nj) joint velocities."""
-        return self._columns("qvel", self._joint_v)
-
-    @property
-    def joint_acc(self) -> torch.Tensor:
-        """(N, nj) joint accelerations, of the last substep."""
-        return self._columns("qacc", self._joint_v)
-
-    @property
-    def joint_torques(self) -> torch.Tensor:
-        """Not offered: see the error for the two things it could mean."""
-        raise NotImplementedError(
-            "joint_torques could mean two things. Use qfrc_actuator for what the actuators apply "
-            "to the joints, or actuator_force for the force of each actuator before its gear."
-        )
-
-    @property
-    def tendon_len(self) -> torch.Tensor:
-        """(N, number of tendons) tendon lengths."""
-        return self._columns("ten_length", self._tendons)
-
-    @property
-    def tendon_vel(self) -> torch.Tensor:
-        """(N, number of tendons) tendon velocities."""
-        return self._columns("ten_velocity", self._tendons)
-
-    @property
-    def actuator_force(self) -> torch.Tensor:
-        """(N, number of forces) forces of the actuators in turn, before their gear.
-
-        Those of the last substep. An orientation servo has three, every other actuator one; see
-        `indexing.force_columns`.
-        """
-        return self._columns("actuator_force", self._forces)
-
-    @property
-    def qfrc_actuator(self) -> torch.Tensor:
-        """(N, nj) generalized forces of the actuators on the joints in the last substep."""
-        return self._columns("qfrc_actuator", self._joint_v)
-
-    @property
-    def qfrc_external(self) -> torch.Tensor:
-        """(N, nj) generalized forces on the joints of the wrenches now applied to bodies.
-
-        `sum_b S_j . (tau_b + (p_b - c) x f_b, f_b)` over the bodies b that joint axis j moves, with
-        its motion axis `S_j` (`cdof`) about c, the centre of mass of the tree.
-        """
-        # Not `qfrc_smooth` without its other parts: those are of different stages of MuJoCo.
-        force, torque = self._columns("xfrc_applied", self._bodies).split(3, dim=-1)
-        arm = self._columns("xipos", self._bodies) - self._tree_com(self._body_trees)
-        wrench = torch.cat((torque + torch.linalg.cross(arm, force), force), dim=-1)
-        # A sum, because products of matrices may be rounded to TF32.
-        below = (self.indexing.moved_bodies[..., None] * wrench[:, None]).sum(dim=2)
-        return (self._columns("cdof", self._joint_v) * below).sum(dim=-1)
+def assign(
+    field: torch.Tensor,
+    value: torch.Tensor,
+    env_ids: EnvIds,
+    columns: slice | torch.Tensor | int,
+) -> None:
+    """Write `value` into rows `env_ids` and `columns` of `field`; tensors select their product."""
+    if env_ids is None:
+        field[:, columns] = value
+    elif isinstance(columns, torch.Tensor) and not isinstance(env_ids, slice):
+        field[as_ids(env_ids, len(field), field.device)[:, None], columns] = value
+    else:
+        field[env_ids, columns] = value
 
 
 __getattr__ = older_names(__name__)

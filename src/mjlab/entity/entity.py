@@ -6,127 +6,377 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import torch
 
-from mjlab.actuator import (
-    Actuator,
-    ActuatorCfg,
-    BuiltinActuatorGroup,
-    FusedActuatorGroup,
-    TransmissionType,
-)
+from mjlab.actuator.actuator import Actuator, ActuatorCfg, TransmissionType
+from mjlab.actuator.builtin_group import BuiltinActuatorGroup
+from mjlab.actuator.fused_group import FusedActuatorGroup
 from mjlab.entity.building import (
+    Found,
     add_key,
     build_actuators,
+    copy_spec,
     find_joints,
+    find_names,
     place_body,
+    pop_keyframes,
+    pop_options,
     resolve_initial_state,
-    short_name,
-    take_keys,
-    take_options,
+    short_names,
 )
 from mjlab.entity.data import EntityData, as_values, assign
 from mjlab.entity.indexing import EntityIndexing as EntityIndexing
 from mjlab.entity.indexing import Ids, build_indexing
+from mjlab.sim.randomization import VariantInfo
 from mjlab.utils import spec_config as spec_cfg
-from mjlab.utils.indexing import EnvIds, as_ids
-from mjlab.utils.lab_api.string import resolve_matching_names
+from mjlab.utils.errors import WrongStateError
+from mjlab.utils.indexing import EnvIds, as_ids, as_index
 from mjlab.utils.spec import auto_wrap_fixed_base_mocap, compile_composed
 from mjlab.utils.state import stateful
 from mjlab.utils.xml import fix_spec_xml, strip_buffer_textures
 
-if TYPE_CHECKING:
-    from mjlab.entity.data import EntityData
-    from mjlab.entity.indexing import EntityIndexing
-    from mjlab.entity.variants import VariantMetadata
+
+@dataclass
+class EntityArticulationInfoCfg:
+    """What moves an entity's joints, tendons and sites."""
+
+    actuators: tuple[ActuatorCfg, ...] = ()
+    """Actuators to add, or to take from the XML. Actuators of the XML that are not listed stay in
+    the model with their control at zero."""
+    soft_joint_pos_limit_factor: float = 1.0
+    """Size of the soft joint limits as a share of the limits, about the same middle."""
 
 
-# MERGED mjlab.entity.entity: Names of an entity's elements, and finding elements by regular expression.
+@dataclass
+class EntityCfg:
+    """Describes an entity: any MuJoCo spec, with a floating or a fixed base, with joints or none.
 
-Found = tuple[list[int], list[str]]
+    An entity with a fixed base is put under a mocap body, so that each environment can place it.
+    """
+
+    @dataclass
+    class InitialStateCfg:
+        """The state that reset events start from, before environment origins are added."""
+
+        pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        """Position of the root, in metres."""
+        rot: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+        """Orientation of the root, as a quaternion (w, x, y, z)."""
+        lin_vel: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        """Linear velocity of a floating root, in the world frame."""
+        ang_vel: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        """Angular velocity of a floating root, in the world frame."""
+        joint_pos: dict[str, float] | None = field(default_factory=lambda: {".*": 0.0})
+        """Joint positions by name pattern. A pattern matches the start of a name, the first that
+        does wins, other joints take 0. None takes them from the first keyframe of the XML."""
+        joint_vel: dict[str, float] = field(default_factory=lambda: {".*": 0.0})
+        """Joint velocities by name pattern, likewise."""
+
+    init_state: InitialStateCfg = field(default_factory=InitialStateCfg)
+    """The initial state."""
+    spec_fn: Callable[[], mujoco.MjSpec] = field(default_factory=lambda: mujoco.MjSpec)
+    """Returns the MuJoCo spec of the entity, which is copied."""
+    articulation: EntityArticulationInfoCfg | None = None
+    """Actuators and soft joint limits."""
+    sort_actuators: bool = False
+    """Order actuators by what they act on (joints, tendons, sites) instead of by config."""
+    lights: tuple[spec_cfg.LightCfg, ...] = ()
+    """Lights to add."""
+    cameras: tuple[spec_cfg.CameraCfg, ...] = ()
+    """Cameras to add."""
+    textures: tuple[spec_cfg.TextureCfg, ...] = ()
+    """Textures to add."""
+    materials: tuple[spec_cfg.MaterialCfg, ...] = ()
+    """Materials to add and to give to geoms."""
+    meshes: tuple[spec_cfg.MeshCfg, ...] = ()
+    """Changes of mesh assets."""
+    geoms: tuple[spec_cfg.GeomCfg, ...] = ()
+    """Changes of geoms."""
+    collisions: tuple[spec_cfg.CollisionCfg, ...] = ()
+    """Collision settings of geoms, applied after `geoms`."""
+
+    def build(self) -> Entity:
+        """Build the entity."""
+        return Entity(self)
 
 
-class NamedElements:
-    """What an entity has, by name.
+@stateful
+class Entity:
+    """A simulated thing. Built from its config alone; `initialize` ties it to a simulation.
 
     Names are without the prefix of the scene: the part after the last "/". Elements without a name
     are called "". Every `find_*` takes regular expressions that must match a whole name, and
     returns indices within the entity and names, in the entity's order, or, with `preserve_order`,
-    pattern by pattern. With a subset of names to choose from, indices count in that subset.
+    pattern by pattern. With a subset of names to choose from, indices count in that subset. All
+    raise `ValueError`, listing the candidates, if a pattern matches nothing or two patterns match
+    one name.
 
-    All raise `ValueError`, listing the candidates, if a pattern matches nothing or two patterns
-    match one name.
+    `env_ids` of setters and writers is None (all), a slice, a boolean mask or a one-dimensional
+    tensor of indices; element ids count within the entity and may also be a list. Tensors of both
+    select their product. Values are tensors or arrays of any float type. All raise `ValueError` if a
+    width is wrong or the entity has no such elements. Setters store a target for the next
+    `write_data_to_sim`; writers change the simulation now, and what derives from the state follows
+    at the next `sim.forward()`.
     """
 
-    _spec: mujoco.MjSpec
-    _free_joint: mujoco.MjsJoint | None
-    _joints: tuple[mujoco.MjsJoint, ...]
+    def __init__(self, cfg: EntityCfg) -> None:
+        """Build the entity's spec: the user's, edited, with actuators and initial keyframe.
 
-    def _names(self, kind: str) -> tuple[str, ...]:
-        return _short_names(getattr(self._spec, kind))
+        Raises:
+            ValueError: the spec has several free joints, one that is not its first joint, or ball
+                joints; patterns of actuators or editors do not resolve.
+        """
+        self.cfg = cfg
+        spec = self._make_spec()
+        self.options = pop_options(spec)
+        """Simulation options that the entity's own XML asks for; the scene decides on them."""
+        xml_key = pop_keyframes(spec)
+        self._spec = self._placeable(spec)
+        self._spec_to_write = self._spec
+        self._free_joint, self._joints = find_joints(self._spec)
+        self._data: EntityData | None = None
+        spec_cfg.warn_overlapping_geom_edits(cfg.geoms, cfg.collisions, self._spec)
+        for editors in (
+            cfg.lights, cfg.cameras, cfg.textures, cfg.materials, cfg.meshes, cfg.geoms,
+            cfg.collisions,
+        ):  # fmt: skip
+            for editor in editors:
+                editor.edit_spec(self._spec)
+        self._actuators = build_actuators(
+            () if cfg.articulation is None else cfg.articulation.actuators,
+            self._spec,
+            self._joints,
+            lambda actuator, ids, names: actuator.build(self, ids, names),
+            cfg.sort_actuators,
+        )
+        init = cfg.init_state
+        self.initial_state = resolve_initial_state(
+            self._spec,
+            self._free_joint,
+            self._joints,
+            xml_key,
+            pos=init.pos,
+            rot=init.rot,
+            lin_vel=init.lin_vel,
+            ang_vel=init.ang_vel,
+            joint_pos=init.joint_pos,
+            joint_vel=init.joint_vel,
+        )
+        """The configured initial state, resolved for this entity's joints and actuators."""
+        if self._free_joint is None:
+            place_body(self.root_body, self.initial_state.root_state)
+        add_key(self._spec, [self.initial_state])
+
+    def _make_spec(self) -> mujoco.MjSpec:
+        return copy_spec(self.cfg.spec_fn(), "EntityCfg.spec_fn")
+
+    def _placeable(self, spec: mujoco.MjSpec) -> mujoco.MjSpec:
+        """Return `spec` under a mocap body, if its base is fixed."""
+        return auto_wrap_fixed_base_mocap(lambda: spec)()
+
+    # What it is.
+
+    @property
+    def spec(self) -> mujoco.MjSpec:
+        """The entity's spec. In a scene, its elements carry the prefix of the entity."""
+        return self._spec
+
+    @property
+    def data(self) -> EntityData:
+        """State and targets in all environments.
+
+        Raises:
+            RuntimeError: the entity has not been initialized with a simulation.
+        """
+        if self._data is None:
+            raise WrongStateError(
+                "This entity has no data yet: call Scene.initialize (or Entity.initialize) with "
+                "the compiled model and the simulation first."
+            )
+        return self._data
+
+    @property
+    def indexing(self) -> EntityIndexing:
+        """Where the entity's elements are in the model."""
+        return self.data.indexing
+
+    @property
+    def actuators(self) -> list[Actuator]:
+        """The configured actuators."""
+        return self._actuators
+
+    @property
+    def joints(self) -> tuple[mujoco.MjsJoint, ...]:
+        """The joints, without a free joint, in spec order."""
+        return self._joints
+
+    @property
+    def root_body(self) -> mujoco.MjsBody:
+        """The first body; the mocap body that holds everything, where the base is fixed."""
+        return self._spec.bodies[1]
+
+    @property
+    def is_fixed_base(self) -> bool:
+        """Whether the entity has no free joint."""
+        return self._free_joint is None
+
+    @property
+    def is_articulated(self) -> bool:
+        """Whether the entity has joints other than a free one."""
+        return bool(self._joints)
+
+    @property
+    def is_actuated(self) -> bool:
+        """Whether the entity has configured actuators."""
+        return bool(self._actuators)
+
+    @property
+    def is_mocap(self) -> bool:
+        """Whether the root is a mocap body."""
+        return bool(self.root_body.mocap)
+
+    @property
+    def has_tendon_actuators(self) -> bool:
+        """Whether a configured actuator acts on a tendon."""
+        return TransmissionType.TENDON in {one.transmission_type for one in self._actuators}
+
+    @property
+    def has_site_actuators(self) -> bool:
+        """Whether a configured actuator acts on a site."""
+        return TransmissionType.SITE in {one.transmission_type for one in self._actuators}
+
+    @property
+    def variant_metadata(self) -> VariantInfo | None:
+        """What differs between environments; None unless built from a `VariantEntityCfg`."""
+        return None
+
+    @property
+    def needs_substep(self) -> bool:
+        """Whether an actuator has to act between the physics substeps of one step."""
+        return any(actuator.needs_substep for actuator in self._actuators)
+
+    # Life cycle.
+
+    def compile(self) -> mujoco.MjModel:
+        """Compile the entity alone."""
+        return compile_composed(self._spec)
+
+    def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
+        """Tie the entity to a simulation.
+
+        Args:
+            mj_model: The compiled model of the scene.
+            model: The simulation's model fields.
+            data: The simulation's data fields, whose `nworld` is the number of environments.
+            device: Torch device of the fields.
+        """
+        indexing = build_indexing(self._spec, self._free_joint, self.is_actuated, mj_model, device)
+        self._data = _make_data(self, indexing, model, data, device)
+        for actuator in self._actuators:
+            actuator.initialize(mj_model, model, data, device)
+        self._builtin_group, others = BuiltinActuatorGroup.process(self._actuators)
+        self._fused_group, self._own_actuators = FusedActuatorGroup.process(others)
+        self._builtin_group.initialize(data.nworld, device)
+        self._fused_group.initialize(data.nworld, device)
+
+    def reset(self, env_ids: EnvIds = None) -> None:
+        """Set targets to zero and forget delays and histories; the state is left to events."""
+        self.data.clear_state(env_ids)
+        for actuator in self._actuators:
+            actuator.reset(env_ids)
+
+    def clear_state(self, env_ids: EnvIds = None) -> None:
+        """Deprecated: call `reset`."""
+        warnings.warn(
+            "Entity.clear_state is an older name of Entity.reset.", DeprecationWarning, stacklevel=2
+        )
+        self.reset(env_ids)
+
+    def update(self, dt: float) -> None:
+        """Tell the actuators that `dt` seconds have passed."""
+        for actuator in self._actuators:
+            actuator.update(dt)
+
+    def write_data_to_sim(self, env_ids: EnvIds = None) -> None:
+        """Turn targets into controls, through the actuators.
+
+        With `env_ids`, only those environments' controls are written and only their delay lines
+        and histories advance: an environment never notices that another one was reset.
+        """
+        if not self._actuators:
+            return
+        data = self.data
+        self._builtin_group.apply_controls(data, env_ids)
+        self._fused_group.apply_controls(data, env_ids)
+        for actuator in self._own_actuators:
+            actuator.apply_controls(data, env_ids)
+
+    # Names of elements.
 
     @property
     def body_names(self) -> tuple[str, ...]:
         """Names of the bodies, without the world."""
-        return self._names("bodies")[1:]
+        return short_names(self._spec.bodies[1:])
 
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the joints, without a free joint."""
-        return _short_names(self._joints)
+        return short_names(self._joints)
 
     @property
     def all_joint_names(self) -> tuple[str, ...]:
         """Names of all joints, a free joint included."""
-        return self._names("joints")
+        return short_names(self._spec.joints)
 
     @property
     def geom_names(self) -> tuple[str, ...]:
         """Names of the geoms."""
-        return self._names("geoms")
+        return short_names(self._spec.geoms)
 
     @property
     def site_names(self) -> tuple[str, ...]:
         """Names of the sites."""
-        return self._names("sites")
+        return short_names(self._spec.sites)
 
     @property
     def tendon_names(self) -> tuple[str, ...]:
         """Names of the tendons."""
-        return self._names("tendons")
+        return short_names(self._spec.tendons)
 
     @property
     def actuator_names(self) -> tuple[str, ...]:
         """Names of all actuators in the spec, also of those that no config lists."""
-        return self._names("actuators")
+        return short_names(self._spec.actuators)
 
     @property
     def camera_names(self) -> tuple[str, ...]:
         """Names of the cameras."""
-        return self._names("cameras")
+        return short_names(self._spec.cameras)
 
     @property
     def light_names(self) -> tuple[str, ...]:
         """Names of the lights."""
-        return self._names("lights")
+        return short_names(self._spec.lights)
 
     @property
     def material_names(self) -> tuple[str, ...]:
         """Names of the materials."""
-        return self._names("materials")
+        return short_names(self._spec.materials)
 
     @property
     def texture_names(self) -> tuple[str, ...]:
         """Names of the textures."""
-        return self._names("textures")
+        return short_names(self._spec.textures)
 
     @property
     def pair_names(self) -> tuple[str, ...]:
         """Names of the contact pairs."""
-        return self._names("pairs")
+        return short_names(self._spec.pairs)
+
+    # Numbers of elements.
 
     @property
     def num_bodies(self) -> int:
@@ -183,9 +433,11 @@ class NamedElements:
         """Number of contact pairs."""
         return len(self.pair_names)
 
+    # Finding elements by name.
+
     def find_bodies(self, name_keys: str | Sequence[str], preserve_order: bool = False) -> Found:
         """Find bodies by name."""
-        return _find("bodies", name_keys, self.body_names, None, preserve_order)
+        return find_names("bodies", name_keys, self.body_names, preserve_order=preserve_order)
 
     def find_joints(
         self,
@@ -194,7 +446,7 @@ class NamedElements:
         preserve_order: bool = False,
     ) -> Found:
         """Find joints by name; the free joint is none of them."""
-        return _find("joints", name_keys, self.joint_names, joint_subset, preserve_order)
+        return find_names("joints", name_keys, self.joint_names, joint_subset, preserve_order)
 
     def find_geoms(
         self,
@@ -203,7 +455,7 @@ class NamedElements:
         preserve_order: bool = False,
     ) -> Found:
         """Find geoms by name."""
-        return _find("geoms", name_keys, self.geom_names, geom_subset, preserve_order)
+        return find_names("geoms", name_keys, self.geom_names, geom_subset, preserve_order)
 
     def find_sites(
         self,
@@ -212,7 +464,7 @@ class NamedElements:
         preserve_order: bool = False,
     ) -> Found:
         """Find sites by name."""
-        return _find("sites", name_keys, self.site_names, site_subset, preserve_order)
+        return find_names("sites", name_keys, self.site_names, site_subset, preserve_order)
 
     def find_tendons(
         self,
@@ -221,7 +473,7 @@ class NamedElements:
         preserve_order: bool = False,
     ) -> Found:
         """Find tendons by name."""
-        return _find("tendons", name_keys, self.tendon_names, tendon_subset, preserve_order)
+        return find_names("tendons", name_keys, self.tendon_names, tendon_subset, preserve_order)
 
     def find_actuators(
         self,
@@ -230,7 +482,9 @@ class NamedElements:
         preserve_order: bool = False,
     ) -> Found:
         """Find actuators by name."""
-        return _find("actuators", name_keys, self.actuator_names, actuator_subset, preserve_order)
+        return find_names(
+            "actuators", name_keys, self.actuator_names, actuator_subset, preserve_order
+        )
 
     def find_cameras(
         self,
@@ -239,7 +493,7 @@ class NamedElements:
         preserve_order: bool = False,
     ) -> Found:
         """Find cameras by name."""
-        return _find("cameras", name_keys, self.camera_names, camera_subset, preserve_order)
+        return find_names("cameras", name_keys, self.camera_names, camera_subset, preserve_order)
 
     def find_lights(
         self,
@@ -248,7 +502,7 @@ class NamedElements:
         preserve_order: bool = False,
     ) -> Found:
         """Find lights by name."""
-        return _find("lights", name_keys, self.light_names, light_subset, preserve_order)
+        return find_names("lights", name_keys, self.light_names, light_subset, preserve_order)
 
     def find_materials(
         self,
@@ -257,7 +511,9 @@ class NamedElements:
         preserve_order: bool = False,
     ) -> Found:
         """Find materials by name."""
-        return _find("materials", name_keys, self.material_names, material_subset, preserve_order)
+        return find_names(
+            "materials", name_keys, self.material_names, material_subset, preserve_order
+        )
 
     def find_textures(
         self,
@@ -266,7 +522,7 @@ class NamedElements:
         preserve_order: bool = False,
     ) -> Found:
         """Find textures by name."""
-        return _find("textures", name_keys, self.texture_names, texture_subset, preserve_order)
+        return find_names("textures", name_keys, self.texture_names, texture_subset, preserve_order)
 
     def find_pairs(
         self,
@@ -275,47 +531,26 @@ class NamedElements:
         preserve_order: bool = False,
     ) -> Found:
         """Find contact pairs by name."""
-        return _find("pairs", name_keys, self.pair_names, pair_subset, preserve_order)
+        return find_names("pairs", name_keys, self.pair_names, pair_subset, preserve_order)
 
+    def find_joints_by_actuator_names(self, actuator_name_keys: Any) -> Found:
+        """Find joints, in the entity's order, among those that a configured actuator acts on.
 
-def _short_names(elements: Sequence[Any]) -> tuple[str, ...]:
-    return tuple(short_name(element.name) for element in elements)
+        Raises:
+            ValueError: a pattern matches none of these joints, or two match one; lists them.
+        """
+        actuated = {
+            name
+            for actuator in self._actuators
+            if actuator.transmission_type == TransmissionType.JOINT
+            for name in actuator.target_names
+        }
+        names = self.joint_names
+        candidates = [name for name in names if name in actuated]
+        _, found = find_names("actuated joints", actuator_name_keys, candidates)
+        return [names.index(name) for name in found], found
 
-
-def _find(
-    kind: str,
-    name_keys: str | Sequence[str],
-    names: Sequence[str],
-    subset: Sequence[str] | None,
-    preserve_order: bool,
-) -> Found:
-    try:
-        return resolve_matching_names(
-            name_keys, names if subset is None else subset, preserve_order
-        )
-    except ValueError as error:
-        raise ValueError(f"Cannot find {kind} by {name_keys!r}. {error}") from None
-
-
-# MERGED mjlab.entity.entity: Commands to an entity: targets of its actuators, and state written into the simulation.
-
-
-class EntityCommands:
-    """The setters and writers of `Entity`.
-
-    `env_ids` is None (all), a slice, a boolean mask or a one-dimensional tensor of indices; element
-    ids count within the entity and may also be a list. Tensors of both select their product. Values
-    are tensors or arrays of any float type. All raise `ValueError` if a width is wrong or the entity
-    has no such elements.
-
-    Setters store a target for the next `write_data_to_sim`; writers change the simulation now, and
-    what derives from the state follows at the next `sim.forward()`.
-    """
-
-    @property
-    def data(self) -> EntityData:
-        """State and targets of the entity."""
-        raise NotImplementedError
+    # Targets of actuators.
 
     def set_joint_position_target(
         self, position: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
@@ -368,9 +603,11 @@ class EntityCommands:
         target = self.data.joint_pos_target
         if target.shape[1] == 0:
             return
-        rows = slice(None) if env_ids is None else env_ids
+        rows = as_index(env_ids)
         chosen = target[rows]
         target[rows] = torch.where(chosen == 0.0, self.data.joint_pos[rows], chosen)
+
+    # Writing the state.
 
     def write_root_state_to_sim(self, root_state: torch.Tensor, env_ids: EnvIds = None) -> None:
         """Write the root link's pose and velocity (k, 13)."""
@@ -443,15 +680,38 @@ class EntityCommands:
         """Write the pose of the mocap root (k, 7): position, quaternion (w, x, y, z)."""
         self.data.write_mocap_pose(mocap_pose, env_ids)
 
+    # Files.
+
+    def snapshot_spec(self) -> None:
+        """Keep a copy of the spec for `write_xml` and `to_zip`. A scene calls this.
+
+        MuJoCo cannot write a spec that has been attached to another one.
+        """
+        self._spec_to_write = self._spec.copy()
+
+    def write_xml(self, xml_path: Path) -> None:
+        """Write the entity's spec as XML, without textures made from raw pixels.
+
+        Of an entity in a scene this is the spec as it was before the scene took it in.
+        """
+        spec = self._spec_to_write.copy()
+        strip_buffer_textures(spec)
+        Path(xml_path).write_text(fix_spec_xml(spec.to_xml()))
+
+    def to_zip(self, path: Path) -> None:
+        """Write the entity's spec and its assets as MuJoCo's own archive, as `write_xml` does."""
+        with open(path, "wb") as file:
+            self._spec_to_write.to_zip(file)
+
 
 def _set_target(
-    target: torch.Tensor, value: torch.Tensor, ids: Ids, env_ids: EnvIds, what: str
+    target: torch.Tensor, value: torch.Tensor, ids: Ids, env_ids: EnvIds, kind: str
 ) -> None:
     width = target.shape[1]
     if width == 0:
         raise ValueError(
-            f"This entity has no {what} targets: it has no {what}s"
-            + ("." if what == "joint" else f", or no configured actuator acts on a {what}.")
+            f"This entity has no {kind} targets: it has no {kind}s"
+            + ("." if kind == "joint" else f", or no configured actuator acts on a {kind}.")
         )
     columns: slice | torch.Tensor
     if ids is None:
@@ -461,19 +721,12 @@ def _set_target(
     else:
         columns = as_ids(ids, width, target.device)
         width = columns.shape[0]
-    values = as_values(value, width, f"The {what} target", str(target.device), broadcasts=True)
+    values = as_values(value, width, f"The {kind} target", str(target.device), broadcasts=True)
     assign(target, values, env_ids, columns)
 
 
-# MERGED mjlab.entity.entity: The tensors of an entity's data, made once its model is compiled.
-
-
-def make_data(
-    entity: Entity,
-    indexing: EntityIndexing,
-    model: Any,
-    data: Any,
-    device: str,
+def _make_data(
+    entity: Entity, indexing: EntityIndexing, model: Any, data: Any, device: str
 ) -> EntityData:
     """Return the data of `entity`, with defaults from its config and all targets zero."""
     num_envs = data.nworld
@@ -489,7 +742,11 @@ def make_data(
 
     articulation = entity.cfg.articulation
     factor = 1.0 if articulation is None else articulation.soft_joint_pos_limit_factor
-    limits = _joint_limits(model, indexing)
+    ids = indexing.joint_ids.long()
+    # Read from the simulation, because variants of an entity may have limits of their own.
+    limits, limited = model.jnt_range[:, ids].clone().float(), model.jnt_limited[..., ids].bool()
+    limits[..., 0].masked_fill_(~limited, -torch.inf)
+    limits[..., 1].masked_fill_(~limited, torch.inf)
     num_tendons = len(indexing.tendons) if entity.has_tendon_actuators else 0
     return EntityData(
         indexing=indexing,
@@ -518,325 +775,9 @@ def make_data(
     )
 
 
-def _joint_limits(model: Any, indexing: EntityIndexing) -> torch.Tensor:
-    """Return (N, nj, 2) limits, infinite where the compiled joint is not limited."""
-    ids = indexing.joint_ids.long()
-    # Read from the simulation, because variants of an entity may have limits of their own.
-    limits = model.jnt_range[:, ids].clone().float()
-    limited = model.jnt_limited[..., ids].bool()
-    limits[..., 0].masked_fill_(~limited, -torch.inf)
-    limits[..., 1].masked_fill_(~limited, torch.inf)
-    return limits
-
-
 def _shrunk(limits: torch.Tensor, factor: float) -> torch.Tensor:
     """Return limits scaled by `factor` about their middle; infinite ones stay so."""
     middle = limits.mean(dim=-1)
     half = 0.5 * factor * (limits[..., 1] - limits[..., 0])
     shrunk = torch.stack((middle - half, middle + half), dim=-1)
     return torch.where(torch.isinf(limits), limits, shrunk)
-
-
-@dataclass
-class EntityArticulationInfoCfg:
-    """What moves an entity's joints, tendons and sites."""
-
-    actuators: tuple[ActuatorCfg, ...] = ()
-    """Actuators to add, or to take from the XML. Actuators of the XML that are not listed stay in
-    the model with their control at zero."""
-    soft_joint_pos_limit_factor: float = 1.0
-    """Size of the soft joint limits as a share of the limits, about the same middle."""
-
-
-@dataclass
-class EntityCfg:
-    """Describes an entity: any MuJoCo spec, with a floating or a fixed base, with joints or none.
-
-    An entity with a fixed base is put under a mocap body, so that each environment can place it.
-    """
-
-    @dataclass
-    class InitialStateCfg:
-        """The state that reset events start from, before environment origins are added."""
-
-        pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
-        """Position of the root, in metres."""
-        rot: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-        """Orientation of the root, as a quaternion (w, x, y, z)."""
-        lin_vel: tuple[float, float, float] = (0.0, 0.0, 0.0)
-        """Linear velocity of a floating root, in the world frame."""
-        ang_vel: tuple[float, float, float] = (0.0, 0.0, 0.0)
-        """Angular velocity of a floating root, in the world frame."""
-        joint_pos: dict[str, float] | None = field(default_factory=lambda: {".*": 0.0})
-        """Joint positions by name pattern. A pattern matches the start of a name, the first that
-        does wins, other joints take 0. None takes them from the first keyframe of the XML."""
-        joint_vel: dict[str, float] = field(default_factory=lambda: {".*": 0.0})
-        """Joint velocities by name pattern, likewise."""
-
-    init_state: InitialStateCfg = field(default_factory=InitialStateCfg)
-    """The initial state."""
-    spec_fn: Callable[[], mujoco.MjSpec] = field(default_factory=lambda: mujoco.MjSpec)
-    """Returns the MuJoCo spec of the entity, which is copied."""
-    articulation: EntityArticulationInfoCfg | None = None
-    """Actuators and soft joint limits."""
-    sort_actuators: bool = False
-    """Order actuators by what they act on (joints, tendons, sites) instead of by config."""
-    lights: tuple[spec_cfg.LightCfg, ...] = ()
-    """Lights to add."""
-    cameras: tuple[spec_cfg.CameraCfg, ...] = ()
-    """Cameras to add."""
-    textures: tuple[spec_cfg.TextureCfg, ...] = ()
-    """Textures to add."""
-    materials: tuple[spec_cfg.MaterialCfg, ...] = ()
-    """Materials to add and to give to geoms."""
-    meshes: tuple[spec_cfg.MeshCfg, ...] = ()
-    """Changes of mesh assets."""
-    geoms: tuple[spec_cfg.GeomCfg, ...] = ()
-    """Changes of geoms."""
-    collisions: tuple[spec_cfg.CollisionCfg, ...] = ()
-    """Collision settings of geoms, applied after `geoms`."""
-
-    def build(self) -> Entity:
-        """Build the entity."""
-        return Entity(self)
-
-
-@stateful
-class Entity(NamedElements, EntityCommands):
-    """A simulated thing. Built from its config alone; `initialize` ties it to a simulation."""
-
-    def __init__(self, cfg: EntityCfg) -> None:
-        """Build the entity's spec: the user's, edited, with actuators and initial keyframe.
-
-        Raises:
-            ValueError: the spec has several free joints, one that is not its first joint, or ball
-                joints; patterns of actuators or editors do not resolve.
-        """
-        self.cfg = cfg
-        spec = self._make_spec()
-        self.options = take_options(spec)
-        """Simulation options that the entity's own XML asks for; the scene decides on them."""
-        xml_key = take_keys(spec)
-        self._spec = self._placeable(spec)
-        self._spec_to_write = self._spec
-        self._free_joint, self._joints = find_joints(self._spec)
-        self._data: EntityData | None = None
-        self._edit_spec()
-        self._actuators = build_actuators(self)
-        self.initial_state = resolve_initial_state(
-            cfg, self._spec, self._free_joint, self._joints, xml_key
-        )
-        """The configured initial state, resolved for this entity's joints and actuators."""
-        if self._free_joint is None:
-            place_body(self.root_body, self.initial_state.root_state)
-        add_key(self._spec, [self.initial_state])
-
-    def _make_spec(self) -> mujoco.MjSpec:
-        spec = self.cfg.spec_fn()
-        if not isinstance(spec, mujoco.MjSpec):
-            raise ValueError(
-                f"EntityCfg.spec_fn returned {type(spec).__name__}; it must return a "
-                "mujoco.MjSpec, such as mujoco.MjSpec.from_file(path)."
-            )
-        # Editors change it, a scene takes it in, and a function might return one spec twice.
-        return spec.copy()
-
-    def _placeable(self, spec: mujoco.MjSpec) -> mujoco.MjSpec:
-        """Return `spec` under a mocap body, if its base is fixed."""
-        return auto_wrap_fixed_base_mocap(lambda: spec)()
-
-    def _edit_spec(self) -> None:
-        cfg = self.cfg
-        spec_cfg.warn_overlapping_geom_edits(cfg.geoms, cfg.collisions, self._spec)
-        for editors in (
-            cfg.lights, cfg.cameras, cfg.textures, cfg.materials, cfg.meshes, cfg.geoms,
-            cfg.collisions,
-        ):  # fmt: skip
-            for editor in editors:
-                editor.edit_spec(self._spec)
-
-    # What it is.
-
-    @property
-    def spec(self) -> mujoco.MjSpec:
-        """The entity's spec. In a scene, its elements carry the prefix of the entity."""
-        return self._spec
-
-    @property
-    def data(self) -> EntityData:
-        """State and targets in all environments.
-
-        Raises:
-            RuntimeError: the entity has not been initialized with a simulation.
-        """
-        if self._data is None:
-            raise RuntimeError(
-                "This entity has no data yet: call Scene.initialize (or Entity.initialize) with "
-                "the compiled model and the simulation first."
-            )
-        return self._data
-
-    @property
-    def indexing(self) -> EntityIndexing:
-        """Where the entity's elements are in the model."""
-        return self.data.indexing
-
-    @property
-    def actuators(self) -> list[Actuator]:
-        """The configured actuators."""
-        return self._actuators
-
-    @property
-    def joints(self) -> tuple[mujoco.MjsJoint, ...]:
-        """The joints, without a free joint, in spec order."""
-        return self._joints
-
-    @property
-    def root_body(self) -> mujoco.MjsBody:
-        """The first body; the mocap body that holds everything, where the base is fixed."""
-        return self._spec.bodies[1]
-
-    @property
-    def is_fixed_base(self) -> bool:
-        """Whether the entity has no free joint."""
-        return self._free_joint is None
-
-    @property
-    def is_articulated(self) -> bool:
-        """Whether the entity has joints other than a free one."""
-        return bool(self._joints)
-
-    @property
-    def is_actuated(self) -> bool:
-        """Whether the entity has configured actuators."""
-        return bool(self._actuators)
-
-    @property
-    def is_mocap(self) -> bool:
-        """Whether the root is a mocap body."""
-        return bool(self.root_body.mocap)
-
-    @property
-    def has_tendon_actuators(self) -> bool:
-        """Whether a configured actuator acts on a tendon."""
-        return self._acts_on(TransmissionType.TENDON)
-
-    @property
-    def has_site_actuators(self) -> bool:
-        """Whether a configured actuator acts on a site."""
-        return self._acts_on(TransmissionType.SITE)
-
-    def _acts_on(self, transmission: TransmissionType) -> bool:
-        return any(actuator.transmission_type == transmission for actuator in self._actuators)
-
-    @property
-    def variant_metadata(self) -> VariantMetadata | None:
-        """What differs between environments; None unless built from a `VariantEntityCfg`."""
-        return None
-
-    @property
-    def needs_substep(self) -> bool:
-        """Whether an actuator has to act between the physics substeps of one step."""
-        return any(actuator.needs_substep for actuator in self._actuators)
-
-    def find_joints_by_actuator_names(self, actuator_name_keys: Any) -> Found:
-        """Find joints, in the entity's order, among those that a configured actuator acts on.
-
-        Raises:
-            ValueError: a pattern matches none of these joints, or two match one; lists them.
-        """
-        actuated = {
-            name
-            for actuator in self._actuators
-            if actuator.transmission_type == TransmissionType.JOINT
-            for name in actuator.target_names
-        }
-        names = self.joint_names
-        try:
-            _, found = resolve_matching_names(
-                actuator_name_keys, [name for name in names if name in actuated]
-            )
-        except ValueError as error:
-            raise ValueError(
-                f"Cannot find actuated joints by {actuator_name_keys!r}. {error}"
-            ) from None
-        return [names.index(name) for name in found], found
-
-    # Life cycle.
-
-    def compile(self) -> mujoco.MjModel:
-        """Compile the entity alone."""
-        return compile_composed(self._spec)
-
-    def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
-        """Tie the entity to a simulation.
-
-        Args:
-            mj_model: The compiled model of the scene.
-            model: The simulation's model fields.
-            data: The simulation's data fields, whose `nworld` is the number of environments.
-            device: Torch device of the fields.
-        """
-        indexing = build_indexing(self._spec, self._free_joint, self.is_actuated, mj_model, device)
-        self._data = make_data(self, indexing, model, data, device)
-        for actuator in self._actuators:
-            actuator.initialize(mj_model, model, data, device)
-        self._builtin_group, others = BuiltinActuatorGroup.process(self._actuators)
-        self._fused_group, self._own_actuators = FusedActuatorGroup.process(others)
-        self._builtin_group.initialize(data.nworld, device)
-        self._fused_group.initialize(data.nworld, device)
-
-    def reset(self, env_ids: EnvIds = None) -> None:
-        """Set targets to zero and forget delays and histories; the state is left to events."""
-        self.data.clear_state(env_ids)
-        for actuator in self._actuators:
-            actuator.reset(env_ids)
-
-    def clear_state(self, env_ids: EnvIds = None) -> None:
-        """Deprecated: call `reset`."""
-        warnings.warn(
-            "Entity.clear_state is an older name of Entity.reset.", DeprecationWarning, stacklevel=2
-        )
-        self.reset(env_ids)
-
-    def update(self, dt: float) -> None:
-        """Tell the actuators that `dt` seconds have passed."""
-        for actuator in self._actuators:
-            actuator.update(dt)
-
-    def write_data_to_sim(self, env_ids: EnvIds = None) -> None:
-        """Turn targets into controls, through the actuators.
-
-        With `env_ids`, only those environments' controls are written and only their delay lines
-        and histories advance: an environment never notices that another one was reset.
-        """
-        if not self._actuators:
-            return
-        data = self.data
-        self._builtin_group.apply_controls(data, env_ids)
-        self._fused_group.apply_controls(data, env_ids)
-        for actuator in self._own_actuators:
-            actuator.apply_controls(data, env_ids)
-
-    # Files.
-
-    def keep_spec_to_write(self) -> None:
-        """Keep a copy of the spec for `write_xml` and `to_zip`. A scene calls this.
-
-        MuJoCo cannot write a spec that has been attached to another one.
-        """
-        self._spec_to_write = self._spec.copy()
-
-    def write_xml(self, xml_path: Path) -> None:
-        """Write the entity's spec as XML, without textures made from raw pixels.
-
-        Of an entity in a scene this is the spec as it was before the scene took it in.
-        """
-        spec = self._spec_to_write.copy()
-        strip_buffer_textures(spec)
-        Path(xml_path).write_text(fix_spec_xml(spec.to_xml()))
-
-    def to_zip(self, path: Path) -> None:
-        """Write the entity's spec and its assets as MuJoCo's own archive, as `write_xml` does."""
-        with open(path, "wb") as file:
-            self._spec_to_write.to_zip(file)

@@ -24,34 +24,26 @@ Ids: TypeAlias = torch.Tensor | slice | Sequence[int] | None
 
 IdsT = TypeVar("IdsT", bound="Ids | int")
 
-
-class Addresses:
-    """Positions along one axis of a simulation field, and selections of them.
-
-    Positions that follow each other are handed out as a slice, so that reading a field gives a
-    view of it and nothing is copied.
-    """
-
-    def __init__(self, positions: Sequence[int] | torch.Tensor, device: str) -> None:
-        host = positions.tolist() if isinstance(positions, torch.Tensor) else list(positions)
-        self._host = [int(position) for position in host]
-        self._device = device
-        self.tensor = torch.tensor(self._host, dtype=torch.int64, device=device)
-        self.all: slice | torch.Tensor = as_columns(self._host, device)
-        self.constant = self._host[0] if len(set(self._host)) == 1 else None
-
-    def __len__(self) -> int:
-        return len(self._host)
-
-    def select(self, ids: Ids = None) -> tuple[slice | torch.Tensor, int]:
-        """Return the index of the chosen positions, and how many there are."""
-        if ids is None:
-            return self.all, len(self._host)
-        if isinstance(ids, torch.Tensor):
-            chosen = self.tensor[ids]
-            return chosen, chosen.shape[0]
-        host = self._host[ids] if isinstance(ids, slice) else [self._host[int(i)] for i in ids]
-        return as_columns(host, self._device), len(host)
+_OBJECT_TYPES = {
+    "bodies": mujoco.mjtObj.mjOBJ_BODY,
+    "joints": mujoco.mjtObj.mjOBJ_JOINT,
+    "geoms": mujoco.mjtObj.mjOBJ_GEOM,
+    "sites": mujoco.mjtObj.mjOBJ_SITE,
+    "tendons": mujoco.mjtObj.mjOBJ_TENDON,
+    "cameras": mujoco.mjtObj.mjOBJ_CAMERA,
+    "lights": mujoco.mjtObj.mjOBJ_LIGHT,
+    "meshes": mujoco.mjtObj.mjOBJ_MESH,
+    "materials": mujoco.mjtObj.mjOBJ_MATERIAL,
+    "textures": mujoco.mjtObj.mjOBJ_TEXTURE,
+    "pairs": mujoco.mjtObj.mjOBJ_PAIR,
+    "actuators": mujoco.mjtObj.mjOBJ_ACTUATOR,
+    "equalities": mujoco.mjtObj.mjOBJ_EQUALITY,
+    "sensors": mujoco.mjtObj.mjOBJ_SENSOR,
+}
+# Fields of `EntityIndexing` besides bodies and joints.
+_FURTHER_KINDS = (
+    "geoms", "sites", "tendons", "cameras", "lights", "materials", "textures", "pairs", "actuators",
+)  # fmt: skip
 
 
 @dataclass(eq=False)
@@ -134,19 +126,33 @@ class EntityIndexing:
     """For each of `actuators`, its columns among `ctrl_ids`."""
 
 
-def _columns_of(own: tuple[range, ...], actuator_ids: IdsT) -> IdsT | list[int]:
-    """Return the columns of actuators that own some each; the ids themselves if each owns one."""
-    if actuator_ids is None or all(len(columns) == 1 for columns in own):
-        return actuator_ids
-    if isinstance(actuator_ids, torch.Tensor):
-        ids = torch.arange(len(own))[actuator_ids.cpu()].tolist()
-    elif isinstance(actuator_ids, slice):
-        ids = range(len(own))[actuator_ids]
-    elif isinstance(actuator_ids, int):
-        ids = (actuator_ids,)
-    else:
-        ids = actuator_ids
-    return [column for i in ids for column in own[i]]
+class Addresses:
+    """Positions along one axis of a simulation field, and selections of them.
+
+    Positions that follow each other are handed out as a slice, so that reading a field gives a
+    view of it and nothing is copied.
+    """
+
+    def __init__(self, positions: Sequence[int] | torch.Tensor, device: str) -> None:
+        host = positions.tolist() if isinstance(positions, torch.Tensor) else list(positions)
+        self._host = [int(position) for position in host]
+        self._device = device
+        self.tensor = torch.tensor(self._host, dtype=torch.int64, device=device)
+        self.all: slice | torch.Tensor = as_columns(self._host, device)
+        self.constant = self._host[0] if len(set(self._host)) == 1 else None
+
+    def __len__(self) -> int:
+        return len(self._host)
+
+    def select(self, ids: Ids = None) -> tuple[slice | torch.Tensor, int]:
+        """Return the index of the chosen positions, and how many there are."""
+        if ids is None:
+            return self.all, len(self._host)
+        if isinstance(ids, torch.Tensor):
+            chosen = self.tensor[ids]
+            return chosen, chosen.shape[0]
+        host = self._host[ids] if isinstance(ids, slice) else [self._host[int(i)] for i in ids]
+        return as_columns(host, self._device), len(host)
 
 
 def build_indexing(
@@ -168,7 +174,7 @@ def build_indexing(
     elements: dict[str, tuple[Any, ...]] = {
         "bodies": tuple(spec.bodies[1:]),
         "joints": tuple(joint for joint in spec.joints if joint is not free_joint),
-        **{kind: tuple(getattr(spec, kind)) for kind in _OBJECT_TYPES if kind not in _SPECIAL},
+        **{kind: tuple(getattr(spec, kind)) for kind in _FURTHER_KINDS},
     }
     actuators = elements.pop("actuators")
     ids = {kind: element_ids(model, kind, found) for kind, found in elements.items()}
@@ -216,48 +222,50 @@ def build_indexing(
     )
 
 
+def element_ids(model: mujoco.MjModel, kind: str, elements: Iterable[Any]) -> list[int]:
+    """Return the ids of spec elements in `model`: by name, or by spec order without a name.
+
+    Raises:
+        ValueError: an element is not in the model, or is unnamed in a spec that was not compiled.
+    """
+    object_type = _OBJECT_TYPES[kind]
+    name = object_type.name.removeprefix("mjOBJ_").lower()
+    ids = []
+    for element in elements:
+        found = element.id
+        if element.name:
+            found = mujoco.mj_name2id(model, object_type, element.name)
+            if found < 0:
+                raise ValueError(
+                    f"The compiled model has no {name} {element.name!r}. Initialize an entity with "
+                    "the model that was compiled from the spec it belongs to."
+                )
+        elif found < 0:
+            raise ValueError(
+                f"A {name} without a name cannot be found in the model, because its spec was changed "
+                "after it was compiled. Compile that spec, not a copy of it."
+            )
+        ids.append(found)
+    return ids
+
+
+def _columns_of(own: tuple[range, ...], actuator_ids: IdsT) -> IdsT | list[int]:
+    """Return the columns of actuators that own some each; the ids themselves if each owns one."""
+    if actuator_ids is None or all(len(columns) == 1 for columns in own):
+        return actuator_ids
+    if isinstance(actuator_ids, torch.Tensor):
+        ids = torch.arange(len(own))[actuator_ids.cpu()].tolist()
+    elif isinstance(actuator_ids, slice):
+        ids = range(len(own))[actuator_ids]
+    elif isinstance(actuator_ids, int):
+        ids = (actuator_ids,)
+    else:
+        ids = actuator_ids
+    return [column for i in ids for column in own[i]]
+
+
 def _ranges(widths: Iterable[int]) -> tuple[range, ...]:
     """Return ranges of these widths that follow each other from 0."""
     return tuple(
         range(a, b) for a, b in itertools.pairwise(itertools.accumulate(widths, initial=0))
     )
-
-
-_OBJECT_TYPES = {
-    "bodies": mujoco.mjtObj.mjOBJ_BODY,
-    "joints": mujoco.mjtObj.mjOBJ_JOINT,
-    "geoms": mujoco.mjtObj.mjOBJ_GEOM,
-    "sites": mujoco.mjtObj.mjOBJ_SITE,
-    "tendons": mujoco.mjtObj.mjOBJ_TENDON,
-    "cameras": mujoco.mjtObj.mjOBJ_CAMERA,
-    "lights": mujoco.mjtObj.mjOBJ_LIGHT,
-    "materials": mujoco.mjtObj.mjOBJ_MATERIAL,
-    "textures": mujoco.mjtObj.mjOBJ_TEXTURE,
-    "pairs": mujoco.mjtObj.mjOBJ_PAIR,
-    "actuators": mujoco.mjtObj.mjOBJ_ACTUATOR,
-}
-_SPECIAL = ("bodies", "joints")
-
-
-def element_ids(model: mujoco.MjModel, kind: str, elements: Iterable[Any]) -> list[int]:
-    """Return the ids of spec elements in `model`: by name, or by spec order without a name."""
-    return [element_id(model, _OBJECT_TYPES[kind], element) for element in elements]
-
-
-def element_id(model: mujoco.MjModel, object_type: mujoco.mjtObj, element: Any) -> int:
-    """Return the id of a spec element in `model`: by name, or by spec order without a name."""
-    what = object_type.name.removeprefix("mjOBJ_").lower()
-    if element.name:
-        found = mujoco.mj_name2id(model, object_type, element.name)
-        if found < 0:
-            raise ValueError(
-                f"The compiled model has no {what} {element.name!r}. Initialize an entity with "
-                "the model that was compiled from the spec it belongs to."
-            )
-        return found
-    if element.id < 0:
-        raise ValueError(
-            f"A {what} without a name cannot be found in the model, because its spec was changed "
-            "after it was compiled. Compile that spec, not a copy of it."
-        )
-    return element.id

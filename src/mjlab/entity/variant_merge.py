@@ -1,4 +1,9 @@
-"""TODO."""
+"""Merging variants of an entity into one spec: what they must share, slots, assets.
+
+The merged spec has a geom, a slot, for as many geoms as the richest variant has. A slot holds one
+geom of each variant or none. What is compiled once for all environments (type, collision masks,
+condim, priority, group) is a slot's own, so that only geoms alike in these share one.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +15,7 @@ from typing import Any, Literal
 
 import mujoco
 
-from mjlab.utils.mujoco import control_inputs, dof_width, qpos_width
+from mjlab.utils.mujoco import control_inputs
 from mjlab.utils.spec import (
     compile_composed,
     copy_material_data,
@@ -20,13 +25,30 @@ from mjlab.utils.spec import (
     put_files_in_memory,
 )
 
-# MERGED mjlab.entity.variant_merge: What all variants of an entity have to have in common, and checking that they do.
-
 GeomRole = Literal["visual", "collision"]
 RESERVED_NAME_PREFIXES = ("mjlab/pad/",)
 """Beginnings of names that merging variants gives to geoms; specs must not use them."""
-_FREE = mujoco.mjtJoint.mjJNT_FREE
-_MESH = mujoco.mjtGeom.mjGEOM_MESH
+MESH = mujoco.mjtGeom.mjGEOM_MESH
+_UNSUPPORTED = {
+    mujoco.mjtGeom.mjGEOM_PLANE: "plane",
+    mujoco.mjtGeom.mjGEOM_HFIELD: "height field",
+    mujoco.mjtGeom.mjGEOM_SDF: "signed distance field",
+}
+
+# What belongs to a geom's place in its spec, or is set anew.
+_NOT_COPIED = {"name", "id", "signature", "classname", "compiler", "info", "parent", "frame"}
+_NOT_COPIED |= {"meshname", "hfieldname", "material", "mass", "plugin", "userdata"}
+_COPY = {
+    "textures": copy_texture_data,
+    "materials": copy_material_data,
+    "meshes": copy_mesh_data,
+}
+_ADD = {"textures": "add_texture", "materials": "add_material", "meshes": "add_mesh"}
+Assets = dict[str, list[list[Any]]]
+"""By kind, for each variant, the elements of the merged spec in the order of the variant's own."""
+
+
+# What variants must have in common.
 
 
 @dataclass(frozen=True)
@@ -71,42 +93,6 @@ class BodySignature:
     """The bodies attached to it, in order."""
 
 
-def geom_role(geom: mujoco.MjsGeom) -> GeomRole:
-    """Return `visual` for a geom that can touch nothing, else `collision`."""
-    return "collision" if geom.contype or geom.conaffinity else "visual"
-
-
-def walk_bodies(spec: mujoco.MjSpec) -> Iterator[tuple[str, mujoco.MjsBody]]:
-    """Yield the path and the body of each body but the world, parents first."""
-
-    def below(parent: mujoco.MjsBody, path: str) -> Iterator[tuple[str, mujoco.MjsBody]]:
-        for index, body in enumerate(parent.bodies):
-            own = f"{path}/{body.name or f'body{index}'}"
-            yield own, body
-            yield from below(body, own)
-
-    yield from below(spec.worldbody, "")
-
-
-def body_signature(body: mujoco.MjsBody, path: str) -> BodySignature:
-    """Return the signature of a body, whose path is `path`."""
-    children = {f"{path}/{b.name or f'body{i}'}": b for i, b in enumerate(body.bodies)}
-    return BodySignature(
-        path=path,
-        name=body.name,
-        joints=tuple(
-            JointSignature(j.name, int(j.type), qpos_width(j.type), dof_width(j.type))
-            for j in body.joints
-        ),
-        geoms=tuple(
-            GeomSignature(geom.name or None, int(geom.type), geom_role(geom))
-            for geom in body.geoms
-            if geom.type != _MESH
-        ),
-        children=tuple(body_signature(child, own) for own, child in children.items()),
-    )
-
-
 def validate_variant_specs(names: list[str], specs: list[mujoco.MjSpec]) -> None:
     """Check that specs can be variants of one entity: they may differ in geoms and in figures.
 
@@ -116,17 +102,17 @@ def validate_variant_specs(names: list[str], specs: list[mujoco.MjSpec]) -> None
             sites, cameras, lights, actuators, sensors, tendons or equalities.
     """
     for name, spec in zip(names, specs, strict=True):
-        _check_root(name, spec)
-        _check_names(name, spec)
+        _check_variant(name, spec)
     first = _structure(specs[0])
     for name, spec in zip(names[1:], specs[1:], strict=True):
         own = _structure(spec)
-        for what, expected in first.items():
-            if own[what] != expected:
-                raise ValueError(_difference(what, names[0], expected, name, own[what]))
+        for kind, expected in first.items():
+            if own[kind] != expected:
+                raise ValueError(_difference(kind, names[0], expected, name, own[kind]))
 
 
-def _check_root(name: str, spec: mujoco.MjSpec) -> None:
+def _check_variant(name: str, spec: mujoco.MjSpec) -> None:
+    """Raise `ValueError` unless a spec floats as one tree, without reserved names."""
     roots = list(spec.worldbody.bodies)
     if len(roots) != 1:
         raise ValueError(
@@ -134,7 +120,7 @@ def _check_root(name: str, spec: mujoco.MjSpec) -> None:
             "must have exactly one. Put the others below it, or make them entities of their own."
         )
     joints = list(roots[0].joints)
-    if not joints or joints[0].type != _FREE:
+    if not joints or joints[0].type != mujoco.mjtJoint.mjJNT_FREE:
         raise ValueError(
             f"The top-level body {roots[0].name!r} of variant {name!r} has no free joint as its "
             "first joint. Variants must float: add <freejoint/> to it."
@@ -144,9 +130,6 @@ def _check_root(name: str, spec: mujoco.MjSpec) -> None:
             f"Variant {name!r} has geoms or sites in its world body, which belong to no variant. "
             f"Put them into the body {roots[0].name!r}."
         )
-
-
-def _check_names(name: str, spec: mujoco.MjSpec) -> None:
     used = [
         element.name
         for kind in ("bodies", "geoms", "meshes", "materials", "textures")
@@ -194,7 +177,7 @@ def _inertial_kind(body: mujoco.MjsBody) -> str:
     return "fullinertia" if is_full else "diaginertia"
 
 
-def _difference(what: str, first: str, expected: list[Any], name: str, found: list[Any]) -> str:
+def _difference(kind: str, first: str, expected: list[Any], name: str, found: list[Any]) -> str:
     """Return a message that names the first entries that are not the same."""
     missing = [entry for entry in expected if entry not in found]
     extra = [entry for entry in found if entry not in expected]
@@ -203,37 +186,25 @@ def _difference(what: str, first: str, expected: list[Any], name: str, found: li
     else:
         detail = f"{name!r} has them in the order {_shown(found)}, {first!r} {_shown(expected)}"
     return (
-        f"The variants {first!r} and {name!r} have other {what}: {detail}. Variants of an entity "
-        f"may differ in geoms and figures alone. Give {name!r} the same {what} as {first!r}, names "
+        f"The variants {first!r} and {name!r} have other {kind}: {detail}. Variants of an entity "
+        f"may differ in geoms and figures alone. Give {name!r} the same {kind} as {first!r}, names "
         "and order included, or make it an entity of its own."
     )
 
 
 def _shown(entries: list[Any], most: int = 4) -> str:
-    texts = [_text(entry) for entry in entries[:most]]
+    texts = [
+        f"{entry[0]}: {entry[1]}"
+        if isinstance(entry, tuple) and len(entry) == 2 and isinstance(entry[1], list | str)
+        else str(entry)
+        for entry in entries[:most]
+    ]
     if len(entries) > most:
         texts.append(f"... and {len(entries) - most} more")
     return ", ".join(texts) if texts else "nothing"
 
 
-def _text(entry: Any) -> str:
-    if isinstance(entry, tuple) and len(entry) == 2 and isinstance(entry[1], list | str):
-        return f"{entry[0]}: {entry[1]}"
-    return str(entry)
-
-
-# MERGED mjlab.entity.variant_merge: Geoms that variants do not share: which of each goes into which geom of the merged spec.
-#
-# The merged spec has a geom, a slot, for as many geoms as the richest variant has. A slot holds one
-# geom of each variant or none. What is compiled once for all environments (type, collision masks,
-# condim, priority, group) is a slot's own, so that only geoms alike in these share one.
-
-MESH = mujoco.mjtGeom.mjGEOM_MESH
-_UNSUPPORTED = {
-    mujoco.mjtGeom.mjGEOM_PLANE: "plane",
-    mujoco.mjtGeom.mjGEOM_HFIELD: "height field",
-    mujoco.mjtGeom.mjGEOM_SDF: "signed distance field",
-}
+# Slots: geoms that variants do not share.
 
 
 @dataclass(frozen=True, order=True)
@@ -301,10 +272,6 @@ class VariantGeomSpec:
         )
 
 
-def _floats(values: Iterable[float]) -> Any:
-    return tuple(float(value) for value in values)
-
-
 @dataclass(frozen=True)
 class VariantSlot:
     """A geom of the merged spec that holds another geom of each variant, or none."""
@@ -332,14 +299,6 @@ Shared = tuple[mujoco.MjsGeom, ...]
 """One geom that all variants have, as each of them has it."""
 
 
-def geom_kind(geom: mujoco.MjsGeom) -> tuple[int, ...]:
-    """Return what of a geom cannot differ between environments on every engine."""
-    return tuple(
-        int(getattr(geom, name))
-        for name in ("type", "contype", "conaffinity", "condim", "priority", "group")
-    )
-
-
 def split_geoms(
     path: str, bodies: list[mujoco.MjsBody], names: list[str]
 ) -> tuple[list[Shared], list[Slot]]:
@@ -353,15 +312,21 @@ def split_geoms(
     """
     geoms = [list(body.geoms) for body in bodies]
     shared = _shared_geoms(geoms)
-    taken = [{id_of(group[k]) for group in shared} for k in range(len(bodies))]
+    taken = [{group[k].id for group in shared} for k in range(len(bodies))]
     slots: dict[tuple[GeomRole, tuple[int, ...]], list[Slot]] = {}
     counts: Counter[GeomRole] = Counter()
     for k, own in enumerate(geoms):
         used: Counter[tuple[GeomRole, tuple[int, ...]]] = Counter()
         for geom in own:
-            if id_of(geom) in taken[k]:
+            if geom.id in taken[k]:
                 continue
-            _refuse_unsupported(geom, path, names[k])
+            unsupported = _UNSUPPORTED.get(geom.type) or ("plugin" if geom.plugin.active else None)
+            if unsupported is not None:
+                raise ValueError(
+                    f"Variant {names[k]!r} has the {unsupported} geom {geom.name!r} in the body "
+                    f"{path!r}, which its siblings do not have. Variants may differ in meshes and "
+                    "primitives alone: give all of them that geom, by the same name, or none."
+                )
             role, kind = geom_role(geom), geom_kind(geom)
             place = slots.setdefault((role, kind), [])
             if used[role, kind] == len(place):
@@ -371,11 +336,6 @@ def split_geoms(
             place[used[role, kind]].geoms[k] = geom
             used[role, kind] += 1
     return shared, [slot for group in slots.values() for slot in group]
-
-
-def id_of(element: mujoco.MjsGeom) -> int:
-    """Return the id of an element whose spec has been compiled."""
-    return int(element.id)
 
 
 def _shared_geoms(geoms: list[list[mujoco.MjsGeom]]) -> list[Shared]:
@@ -395,66 +355,32 @@ def _shared_geoms(geoms: list[list[mujoco.MjsGeom]]) -> list[Shared]:
     return shared
 
 
-def _refuse_unsupported(geom: mujoco.MjsGeom, path: str, variant: str) -> None:
-    what = _UNSUPPORTED.get(geom.type) or ("plugin" if geom.plugin.active else None)
-    if what is not None:
-        raise ValueError(
-            f"Variant {variant!r} has the {what} geom {geom.name!r} in the body {path!r}, which "
-            "its siblings do not have. Variants may differ in meshes and primitives alone: give "
-            "all of them that geom, by the same name, or none."
-        )
+def geom_kind(geom: mujoco.MjsGeom) -> tuple[int, ...]:
+    """Return what of a geom cannot differ between environments on every engine."""
+    return tuple(
+        int(getattr(geom, name))
+        for name in ("type", "contype", "conaffinity", "condim", "priority", "group")
+    )
 
 
-# MERGED mjlab.entity.variant_merge: Making one spec that has room for every variant of an entity.
+def geom_role(geom: mujoco.MjsGeom) -> GeomRole:
+    """Return `visual` for a geom that can touch nothing, else `collision`."""
+    return "collision" if geom.contype or geom.conaffinity else "visual"
 
 
-# What belongs to a geom's place in its spec, or is set anew.
-_NOT_COPIED = {"name", "id", "signature", "classname", "compiler", "info", "parent", "frame"}
-_NOT_COPIED |= {"meshname", "hfieldname", "material", "mass", "plugin", "userdata"}
-_COPY = {
-    "textures": copy_texture_data,
-    "materials": copy_material_data,
-    "meshes": copy_mesh_data,
-}
-_ADD = {"textures": "add_texture", "materials": "add_material", "meshes": "add_mesh"}
-Assets = dict[str, list[list[Any]]]
-"""By kind, for each variant, the elements of the merged spec in the order of the variant's own."""
+def walk_bodies(spec: mujoco.MjSpec) -> Iterator[tuple[str, mujoco.MjsBody]]:
+    """Yield the path and the body of each body but the world, parents first."""
+
+    def below(parent: mujoco.MjsBody, path: str) -> Iterator[tuple[str, mujoco.MjsBody]]:
+        for index, body in enumerate(parent.bodies):
+            own = f"{path}/{body.name or f'body{index}'}"
+            yield own, body
+            yield from below(body, own)
+
+    yield from below(spec.worldbody, "")
 
 
-def merge_specs(
-    names: list[str],
-    specs: list[mujoco.MjSpec],
-    bodies: list[list[mujoco.MjsBody]],
-    slots: list[list[Slot]],
-) -> tuple[Assets, list[list[mujoco.MjsGeom]]]:
-    """Turn the first of `specs`, in place, into one with the slots and the assets of all.
-
-    Args:
-        names: Names of the variants.
-        specs: Their specs.
-        bodies: For each path, the body of each variant.
-        slots: For each path, the slots of its body.
-
-    Returns:
-        The merged assets, and for each path the geoms of the slots.
-    """
-    merged = specs[0]
-    any_in_memory = any(spec.assets for spec in specs)
-    for name, spec in zip(names, specs, strict=True):
-        _name_after_files(spec)
-        make_asset_paths_absolute(spec)
-        if any_in_memory:
-            put_files_in_memory(spec, f"{name}_")
-    assets = _merge_assets(names, specs)
-    geoms = [
-        [_slot_geom(names, group[0], slot) for slot in own]
-        for group, own in zip(bodies, slots, strict=True)
-    ]
-    _make_hulls(merged, assets, slots, specs)
-    return assets, geoms
-
-
-def refuse_references(
+def check_references(
     name: str, spec: mujoco.MjSpec, slots: list[Slot], shared: list[Shared], k: int
 ) -> None:
     """Check that nothing in the spec of variant `k` names a geom that becomes part of a slot.
@@ -489,11 +415,43 @@ def refuse_references(
             )
 
 
-def _name_after_files(spec: mujoco.MjSpec) -> None:
-    """Give assets the names that the compiler would give them, so that they can be renamed."""
-    for asset in (*spec.meshes, *spec.textures):
-        if not asset.name and asset.file:
-            asset.name = PurePosixPath(asset.file).stem
+# The merged spec.
+
+
+def merge_specs(
+    names: list[str],
+    specs: list[mujoco.MjSpec],
+    bodies: list[list[mujoco.MjsBody]],
+    slots: list[list[Slot]],
+) -> tuple[Assets, list[list[mujoco.MjsGeom]]]:
+    """Turn the first of `specs`, in place, into one with the slots and the assets of all.
+
+    Args:
+        names: Names of the variants.
+        specs: Their specs.
+        bodies: For each path, the body of each variant.
+        slots: For each path, the slots of its body.
+
+    Returns:
+        The merged assets, and for each path the geoms of the slots.
+    """
+    merged = specs[0]
+    any_in_memory = any(spec.assets for spec in specs)
+    for name, spec in zip(names, specs, strict=True):
+        # The names that the compiler would give them, so that they can be renamed.
+        for asset in (*spec.meshes, *spec.textures):
+            if not asset.name and asset.file:
+                asset.name = PurePosixPath(asset.file).stem
+        make_asset_paths_absolute(spec)
+        if any_in_memory:
+            put_files_in_memory(spec, f"{name}_")
+    assets = _merge_assets(names, specs)
+    geoms = [
+        [_slot_geom(names, group[0], slot) for slot in own]
+        for group, own in zip(bodies, slots, strict=True)
+    ]
+    _make_hulls(merged, assets, slots, specs)
+    return assets, geoms
 
 
 def _merge_assets(names: list[str], specs: list[mujoco.MjSpec]) -> Assets:
@@ -510,7 +468,11 @@ def _merge_assets(names: list[str], specs: list[mujoco.MjSpec]) -> Assets:
                 copy(source, target)
                 own.append(target)
             assets[kind].append(own)
-        _prefix_references(name, assets, len(assets["meshes"]) - 1)
+        for material in assets["materials"][-1]:
+            material.textures = [f"{name}/{own}" if own else own for own in material.textures]
+        for mesh in assets["meshes"][-1]:
+            if mesh.material:
+                mesh.material = f"{name}/{mesh.material}"
         files |= spec.assets
     merged.assets = files
     return assets
@@ -534,14 +496,6 @@ def _rename_own(spec: mujoco.MjSpec, prefix: str) -> None:
     for geom in spec.geoms:
         if geom.meshname:
             geom.meshname = prefix + geom.meshname
-
-
-def _prefix_references(name: str, assets: Assets, k: int) -> None:
-    for material in assets["materials"][k]:
-        material.textures = [f"{name}/{own}" if own else own for own in material.textures]
-    for mesh in assets["meshes"][k]:
-        if mesh.material:
-            mesh.material = f"{name}/{mesh.material}"
 
 
 def _slot_geom(names: list[str], body: mujoco.MjsBody, slot: Slot) -> mujoco.MjsGeom:
@@ -588,3 +542,7 @@ def _make_hulls(
         compile_composed(merged)
     for user in users:
         merged.delete(user)
+
+
+def _floats(values: Iterable[float]) -> Any:
+    return tuple(float(value) for value in values)

@@ -15,8 +15,9 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
+from mjlab.entity.building import copy_spec
 from mjlab.entity.entity import Entity, EntityCfg
-from mjlab.entity.indexing import element_id
+from mjlab.entity.indexing import element_ids
 from mjlab.entity.variant_merge import RESERVED_NAME_PREFIXES as RESERVED_NAME_PREFIXES
 from mjlab.entity.variant_merge import BodySignature as BodySignature
 from mjlab.entity.variant_merge import GeomRole as GeomRole
@@ -26,8 +27,8 @@ from mjlab.entity.variant_merge import (
     Shared,
     Slot,
     VariantGeomSpec,
+    check_references,
     merge_specs,
-    refuse_references,
     split_geoms,
     walk_bodies,
 )
@@ -43,260 +44,11 @@ from mjlab.sim.randomization import (
     put_variant_model,
 )
 from mjlab.sim.randomization import VARIANT_DEPENDENT_FIELDS as VARIANT_DEPENDENT_FIELDS
+from mjlab.utils.errors import check_exists
 from mjlab.utils.mujoco import control_columns, dof_width, force_columns, qpos_width
 from mjlab.utils.spec import compile_composed, compile_spec
 
-# MERGED mjlab.entity.variants: Which variant each environment gets.
-
 Assignment = dict[str, float] | Callable[[int], Sequence[int]] | None
-
-
-def allocate_worlds(weights: tuple[float, ...], nworld: int) -> list[int]:
-    """Return the variant of each of `nworld` environments, by weight, in contiguous blocks.
-
-    Each variant gets its quota `w_i / sum(w) * nworld`, rounded down. What is left over goes to the
-    largest remainders, of equal ones to the earlier variant.
-
-    Raises:
-        ValueError: a weight is negative or not finite, or all are zero.
-    """
-    bad = [weight for weight in weights if not (math.isfinite(weight) and weight >= 0.0)]
-    total = sum(weights)
-    if bad or not 0.0 < total < math.inf:
-        raise ValueError(
-            f"The weights of variants are {tuple(weights)}; they must be finite, none negative, "
-            "and not all zero. A weight of 0 leaves a variant out."
-        )
-    quotas = [weight / total * nworld for weight in weights]
-    # Quotas that are whole but for rounding, such as 3 * (1 / 3), count as whole.
-    counts = [math.floor(quota + 1e-9) for quota in quotas]
-    remainders = [quota - count for quota, count in zip(quotas, counts, strict=True)]
-    order = sorted(range(len(weights)), key=lambda k: (-round(remainders[k], 9), k))
-    for k in order[: nworld - sum(counts)]:
-        counts[k] += 1
-    return [k for k, count in enumerate(counts) for _ in range(count)]
-
-
-def resolve_assignment(
-    names: tuple[str, ...], assignment: Assignment
-) -> tuple[float, ...] | Callable[[int], Sequence[int]]:
-    """Return one weight for each variant, or the callable that assigns them.
-
-    Raises:
-        ValueError: `assignment` names a variant that does not exist, or its weights make no sense.
-    """
-    if assignment is not None and not isinstance(assignment, dict):
-        return assignment
-    given: dict[str, float] = {} if assignment is None else assignment
-    unknown = [name for name in given if name not in names]
-    if unknown:
-        raise ValueError(
-            f"VariantEntityCfg.assignment names the variants {unknown}, which do not exist. "
-            f"There are: {list(names)}."
-        )
-    weights = tuple(float(given.get(name, 1.0)) for name in names)
-    try:
-        allocate_worlds(weights, 1)
-    except ValueError as error:
-        raise ValueError(f"VariantEntityCfg.assignment is {given}. {error}") from None
-    return weights
-
-
-def assign_worlds(
-    assignment: tuple[float, ...] | Callable[[int], Sequence[int]],
-    names: tuple[str, ...],
-    nworld: int,
-) -> np.ndarray:
-    """Return the variant of each environment, (nworld,) int64.
-
-    Raises:
-        ValueError: a callable returns another number of indices, or one that no variant has.
-    """
-    if not callable(assignment):
-        return np.array(allocate_worlds(assignment, nworld), dtype=np.int64)
-    found = np.asarray(assignment(nworld))
-    if found.shape != (nworld,) or found.dtype.kind not in "iu":
-        raise ValueError(
-            f"VariantEntityCfg.assignment was called with {nworld} and returned an array of shape "
-            f"{found.shape} and type {found.dtype}; it must return {nworld} whole numbers, the "
-            "index of each environment's variant."
-        )
-    outside = sorted({int(k) for k in found if not 0 <= k < len(names)})
-    if outside:
-        raise ValueError(
-            f"VariantEntityCfg.assignment returned the indices {outside}; the variants "
-            f"{list(names)} have the indices 0 to {len(names) - 1}."
-        )
-    return found.astype(np.int64)
-
-
-# MERGED mjlab.entity.variants: What each variant of an entity puts into the fields of a compiled model.
-
-
-# Kinds of elements, with the beginning of the names of their model fields.
-KINDS = {
-    "bodies": ("body_", mujoco.mjtObj.mjOBJ_BODY),
-    "joints": ("jnt_", mujoco.mjtObj.mjOBJ_JOINT),
-    "geoms": ("geom_", mujoco.mjtObj.mjOBJ_GEOM),
-    "sites": ("site_", mujoco.mjtObj.mjOBJ_SITE),
-    "cameras": ("cam_", mujoco.mjtObj.mjOBJ_CAMERA),
-    "lights": ("light_", mujoco.mjtObj.mjOBJ_LIGHT),
-    "tendons": ("tendon_", mujoco.mjtObj.mjOBJ_TENDON),
-    "actuators": ("actuator_", mujoco.mjtObj.mjOBJ_ACTUATOR),
-    "equalities": ("eq_", mujoco.mjtObj.mjOBJ_EQUALITY),
-    "sensors": ("sensor_", mujoco.mjtObj.mjOBJ_SENSOR),
-}
-
-# Real fields are figures. Of whole numbers, most are addresses; these are figures too.
-_WHOLE_FIGURES = frozenset(
-    {"jnt_limited", "jnt_actfrclimited", "jnt_actgravcomp", "site_type", "site_group", "cam_mode"}
-    | {"cam_projection", "cam_resolution", "light_mode", "light_type", "light_active"}
-    | {"light_castshadow", "tendon_limited", "tendon_actfrclimited", "actuator_ctrllimited"}
-    | {"actuator_forcelimited", "actuator_actlimited", "actuator_dyntype", "actuator_gaintype"}
-    | {"actuator_biastype", "actuator_actearly", "eq_active0"}
-)
-
-# These follow from the others, and are computed for the whole scene.
-_DERIVED = frozenset({"body_margin", "dof_length", "dof_M0", "actuator_length0"}) | (
-    frozenset((*FIXED_CONSTANTS, *CONSTANTS_AT_QPOS0)) - {"actuator_biasprm", "eq_data"}
-)
-
-# One row a control, or a force, of which an actuator may have several.
-_CONTROL_FIELDS = frozenset({"actuator_ctrllimited", "actuator_ctrlrange"})
-_FORCE_FIELDS = frozenset({"actuator_gear", "actuator_lengthrange"})
-_ASSET_FIELDS = {
-    "geom_matid": ("materials", mujoco.mjtObj.mjOBJ_MATERIAL),
-    "site_matid": ("materials", mujoco.mjtObj.mjOBJ_MATERIAL),
-    "tendon_matid": ("materials", mujoco.mjtObj.mjOBJ_MATERIAL),
-    "geom_dataid": ("meshes", mujoco.mjtObj.mjOBJ_MESH),
-}
-
-# What a geom has where it is not there: no extent, no mesh, no colour. The rest stays as it is in
-# another variant.
-_ABSENT = {"geom_size": 0, "geom_rbound": 0, "geom_aabb": 0, "geom_dataid": -1, "geom_matid": -1}
-
-
-class VariantTable:
-    """Values of all variants, each compiled alone, with the merged elements that they are for."""
-
-    def __init__(
-        self,
-        models: list[mujoco.MjModel],
-        elements: dict[str, list[tuple[Any, list[int]]]],
-        assets: dict[str, list[list[Any]]],
-    ) -> None:
-        """Hold them.
-
-        Args:
-            models: Each variant compiled alone.
-            elements: By kind, elements of the merged spec, each with its id in every model; -1
-                where a variant does not have it. The first body is the root.
-            assets: By kind, for each variant, the merged element of each of its meshes and
-                materials.
-        """
-        self._models, self._elements, self._assets = models, elements, assets
-        self._root = elements["bodies"][0][0]
-
-    def columns(self, model: mujoco.MjModel) -> list[VariantColumns]:
-        """Return what each variant puts into `model`, compiled from a spec with the merged one."""
-        ids = {
-            kind: np.array([element_id(model, KINDS[kind][1], e) for e, _ in pairs], dtype=int)
-            for kind, pairs in self._elements.items()
-        }
-        assets = {
-            field: [
-                np.array([element_id(model, kind, e) for e in own] + [-1])
-                for own in self._assets[name]
-            ]
-            for field, (name, kind) in _ASSET_FIELDS.items()
-        }
-        return [self._columns_of(k, model, ids, assets) for k in range(len(self._models))]
-
-    def _columns_of(
-        self,
-        k: int,
-        model: mujoco.MjModel,
-        ids: dict[str, np.ndarray],
-        assets: dict[str, list[np.ndarray]],
-    ) -> VariantColumns:
-        fields: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-        for kind, pairs in self._elements.items():
-            # Of what this variant does not have, the figures come from one that does.
-            sources = [_first_with(own, k) for _, own in pairs]
-            for name in self._fields_of(kind):
-                values = [getattr(self._models[j], name)[i] for j, i in sources]
-                if name in assets:
-                    values = [assets[name][j][i] for (j, _), i in zip(sources, values, strict=True)]
-                if len(values):
-                    fields[name] = ids[kind], np.stack(values)
-        fields |= self._by_address(k, model, ids["joints"], ids["actuators"])
-        # Where the root starts is the entity's initial state, the same for all.
-        for name in ("body_pos", "body_quat"):
-            targets, values = fields[name]
-            fields[name] = targets[1:], values[1:]
-        absent = np.array([own[k] < 0 for _, own in self._elements["geoms"]], dtype=bool)
-        if absent.any():
-            for name, value in _ABSENT.items():
-                fields[name][1][absent] = value
-            fields["geom_rgba"][1][absent, 3] = 0.0
-        return VariantColumns(fields, ids["geoms"][absent])
-
-    def _fields_of(self, kind: str) -> list[str]:
-        """Return the fields with one row for each element of a kind, that hold figures."""
-        prefix, model = KINDS[kind][0], self._models[0]
-        names = [name for name in dir(model) if name.startswith(prefix)]
-        return [
-            name
-            for name in names
-            if isinstance(array := getattr(model, name), np.ndarray)
-            and name not in _DERIVED | _CONTROL_FIELDS | _FORCE_FIELDS
-            and (array.dtype.kind == "f" or name in _WHOLE_FIGURES or name in _ASSET_FIELDS)
-        ]
-
-    def _by_address(
-        self, k: int, model: mujoco.MjModel, joints: np.ndarray, actuators: np.ndarray
-    ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Return the fields with rows for degrees of freedom, positions, controls and forces."""
-        own = self._models[k]
-        there = [ids[k] for _, ids in self._elements["actuators"]]
-        places: dict[str, list[tuple[int, int]]] = {
-            "dof": [],
-            "qpos": [],
-            "control": _pairs(control_columns(model, actuators), control_columns(own, there)),
-            "force": _pairs(force_columns(model, actuators), force_columns(own, there)),
-        }
-        for joint, (_, ids) in zip(joints, self._elements["joints"], strict=True):
-            kind, joint_there = int(model.jnt_type[joint]), ids[k]
-            for j in range(dof_width(kind)):
-                places["dof"].append((model.jnt_dofadr[joint] + j, own.jnt_dofadr[joint_there] + j))
-            if kind != mujoco.mjtJoint.mjJNT_FREE:
-                for j in range(qpos_width(kind)):
-                    places["qpos"].append(
-                        (model.jnt_qposadr[joint] + j, own.jnt_qposadr[joint_there] + j)
-                    )
-        names = {"qpos0": "qpos", "qpos_spring": "qpos"}
-        names |= {name: "dof" for name in dir(own) if name.startswith("dof_")}
-        names |= dict.fromkeys(_CONTROL_FIELDS, "control") | dict.fromkeys(_FORCE_FIELDS, "force")
-        fields = {}
-        for name, kind in names.items():
-            array = getattr(own, name)
-            is_figure = array.dtype.kind == "f" or name in _WHOLE_FIGURES
-            if places[kind] and is_figure and name not in _DERIVED:
-                here, rows = np.array(places[kind], dtype=int).T
-                fields[name] = here, array[rows]
-        return fields
-
-
-def _pairs(here: list[int], there: list[int]) -> list[tuple[int, int]]:
-    return list(zip(here, there, strict=True))
-
-
-def _first_with(ids: list[int], k: int) -> tuple[int, int]:
-    """Return the variant to take figures from, `k` if it can be, and the id of the element in it."""
-    if ids[k] >= 0:
-        return k, ids[k]
-    return next((j, i) for j, i in enumerate(ids) if i >= 0)
-
 
 InertialMode = Literal["mesh-derived", "diagonal", "fullinertia"]
 """Source of a body's inertia: its geoms, `diaginertia` or `fullinertia`."""
@@ -415,18 +167,26 @@ class VariantEntity(Entity):
                 "VariantEntityCfg.variants is empty. Give at least one function that makes a spec, "
                 "by the name of its variant."
             )
-        sources = [_make_spec(name, make) for name, make in cfg.variants.items()]
+        sources = [
+            copy_spec(make(), f"VariantEntityCfg.variants[{name!r}]")
+            for name, make in cfg.variants.items()
+        ]
         validate_variant_specs(list(names), sources)
         self._first = sources[0]
-        try:
-            super().__init__(cfg)
-        except ValueError as error:
-            raise ValueError(f"Variant {names[0]!r}: {error}") from error
-        others = [
-            _built_alone(cfg, name, spec) for name, spec in zip(names[1:], sources[1:], strict=True)
-        ]
+        settings = {f.name: getattr(cfg, f.name) for f in fields(EntityCfg)}
+        specs = []
+        for name, spec in zip(names, sources, strict=True):
+            try:
+                if spec is self._first:
+                    super().__init__(cfg)
+                    specs.append(self._spec)
+                else:
+                    settings["spec_fn"] = lambda spec=spec: spec
+                    specs.append(EntityCfg(**settings).build().spec)
+            except ValueError as error:
+                raise ValueError(f"Variant {name!r}: {error}") from error
         weights = resolve_assignment(names, cfg.assignment)
-        self._metadata = _merge(list(names), [self._spec, *others], weights)
+        self._metadata = _merge(list(names), specs, weights)
 
     def _make_spec(self) -> mujoco.MjSpec:
         return self._first
@@ -435,106 +195,6 @@ class VariantEntity(Entity):
     def variant_metadata(self) -> VariantMetadata:
         """What there is in which environment."""
         return self._metadata
-
-
-def _make_spec(name: str, make: Callable[[], mujoco.MjSpec]) -> mujoco.MjSpec:
-    spec = make()
-    if not isinstance(spec, mujoco.MjSpec):
-        raise ValueError(
-            f"VariantEntityCfg.variants[{name!r}] returned {type(spec).__name__}; it must return a "
-            "mujoco.MjSpec, such as mujoco.MjSpec.from_file(path)."
-        )
-    # Editors change it, and a function might return one spec twice.
-    return spec.copy()
-
-
-def _built_alone(cfg: VariantEntityCfg, name: str, spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """Return a variant's spec with all that the config adds to it."""
-    settings: dict[str, Any] = {f.name: getattr(cfg, f.name) for f in fields(EntityCfg)}
-    settings["spec_fn"] = lambda: spec
-    try:
-        return EntityCfg(**settings).build().spec
-    except ValueError as error:
-        raise ValueError(f"Variant {name!r}: {error}") from error
-
-
-def _merge(
-    names: list[str],
-    specs: list[mujoco.MjSpec],
-    assignment: tuple[float, ...] | Callable[[int], Sequence[int]],
-) -> VariantMetadata:
-    """Turn the first spec into the merged one, and say what is in it."""
-    models = [_compiled(name, spec) for name, spec in zip(names, specs, strict=True)]
-    source_specs = tuple(spec.copy() for spec in specs)
-    paths = [path for path, _ in walk_bodies(specs[0])]
-    bodies = [list(group) for group in zip(*(_bodies(spec) for spec in specs), strict=True)]
-    split = [split_geoms(path, own, names) for path, own in zip(paths, bodies, strict=True)]
-    shared: list[Shared] = [group for own, _ in split for group in own]
-    slots = [slot for _, own in split for slot in own]
-    for k, (name, spec) in enumerate(zip(names, specs, strict=True)):
-        refuse_references(name, spec, slots, shared, k)
-    elements = _pairs_variants(specs, bodies, shared)
-    slot_ids = [[-1 if geom is None else int(geom.id) for geom in slot.geoms] for slot in slots]
-    described = _describe(slots, len(names))
-    assets, geoms = merge_specs(names, specs, bodies, [own for _, own in split])
-    merged_geoms = [geom for own in geoms for geom in own]
-    elements["geoms"] += list(zip(merged_geoms, slot_ids, strict=True))
-    return VariantMetadata(
-        tuple(names),
-        assignment,
-        *described,
-        source_specs,
-        VariantTable(models, elements, assets),
-    )
-
-
-def _bodies(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:
-    return [body for _, body in walk_bodies(spec)]
-
-
-def _compiled(name: str, spec: mujoco.MjSpec) -> mujoco.MjModel:
-    # A scene takes no notice of these settings of a part, and they would change what there is.
-    spec.compiler.discardvisual = False
-    spec.compiler.fusestatic = False
-    try:
-        return compile_composed(spec)
-    except ValueError as error:
-        raise ValueError(f"Variant {name!r} does not compile: {error}") from error
-
-
-def _pairs_variants(
-    specs: list[mujoco.MjSpec], bodies: list[list[mujoco.MjsBody]], shared: list[Shared]
-) -> dict[str, list[tuple[Any, list[int]]]]:
-    """Return by kind the elements that all variants have, with their id in each."""
-    groups: dict[str, list[Any]] = {"bodies": bodies, "geoms": shared}
-    for kind in KINDS:
-        if kind not in groups:
-            groups[kind] = list(zip(*(getattr(spec, kind) for spec in specs), strict=True))
-    return {
-        kind: [(group[0], [int(element.id) for element in group]) for group in groups[kind]]
-        for kind in KINDS
-    }
-
-
-def _describe(slots: list[Slot], count: int) -> tuple[Any, Any]:
-    """Return the slots as metadata shows them, and what each variant has in them."""
-    ordered = sorted(slots, key=lambda s: (s.key.body_path, s.key.role != "visual", s.key.ordinal))
-    shown = tuple(
-        VariantSlot(
-            slot.key,
-            slot.key.name,
-            tuple(None if geom is None else geom.name or None for geom in slot.geoms),
-        )
-        for slot in ordered
-    )
-    specs = tuple(
-        tuple(
-            None if (geom := slot.geoms[k]) is None else VariantGeomSpec.of(geom)
-            for slot in ordered
-        )
-        for k in range(count)
-    )
-    return shown, specs
 
 
 def build_merged_variant_spec(cfg: VariantEntityCfg) -> tuple[mujoco.MjSpec, VariantMetadata]:
@@ -584,3 +244,309 @@ def build_variant_model(
     return MeshVariantResult(
         put_variant_model(model, nworld, values), model, values.world_to_variant
     )
+
+
+# Which variant each environment gets.
+
+
+def allocate_worlds(weights: tuple[float, ...], nworld: int) -> list[int]:
+    """Return the variant of each of `nworld` environments, by weight, in contiguous blocks.
+
+    Each variant gets its quota `w_i / sum(w) * nworld`, rounded down. What is left over goes to the
+    largest remainders, of equal ones to the earlier variant.
+
+    Raises:
+        ValueError: a weight is negative or not finite, or all are zero.
+    """
+    bad = [weight for weight in weights if not (math.isfinite(weight) and weight >= 0.0)]
+    total = sum(weights)
+    if bad or not 0.0 < total < math.inf:
+        raise ValueError(
+            f"The weights of variants are {tuple(weights)}; they must be finite, none negative, "
+            "and not all zero. A weight of 0 leaves a variant out."
+        )
+    quotas = [weight / total * nworld for weight in weights]
+    # Quotas that are whole but for rounding, such as 3 * (1 / 3), count as whole.
+    counts = [math.floor(quota + 1e-9) for quota in quotas]
+    remainders = [quota - count for quota, count in zip(quotas, counts, strict=True)]
+    order = sorted(range(len(weights)), key=lambda k: (-round(remainders[k], 9), k))
+    for k in order[: nworld - sum(counts)]:
+        counts[k] += 1
+    return [k for k, count in enumerate(counts) for _ in range(count)]
+
+
+def resolve_assignment(
+    names: tuple[str, ...], assignment: Assignment
+) -> tuple[float, ...] | Callable[[int], Sequence[int]]:
+    """Return one weight for each variant, or the callable that assigns them.
+
+    Raises:
+        ValueError: `assignment` names a variant that does not exist, or its weights make no sense.
+    """
+    if assignment is not None and not isinstance(assignment, dict):
+        return assignment
+    weights_by_name: dict[str, float] = {} if assignment is None else assignment
+    for name in weights_by_name:
+        check_exists("variant in VariantEntityCfg.assignment", name, names)
+    weights = tuple(float(weights_by_name.get(name, 1.0)) for name in names)
+    try:
+        allocate_worlds(weights, 1)
+    except ValueError as error:
+        raise ValueError(f"VariantEntityCfg.assignment is {weights_by_name}. {error}") from None
+    return weights
+
+
+def assign_worlds(
+    assignment: tuple[float, ...] | Callable[[int], Sequence[int]],
+    names: tuple[str, ...],
+    nworld: int,
+) -> np.ndarray:
+    """Return the variant of each environment, (nworld,) int64.
+
+    Raises:
+        ValueError: a callable returns another number of indices, or one that no variant has.
+    """
+    if not callable(assignment):
+        return np.array(allocate_worlds(assignment, nworld), dtype=np.int64)
+    found = np.asarray(assignment(nworld))
+    if found.shape != (nworld,) or found.dtype.kind not in "iu":
+        raise ValueError(
+            f"VariantEntityCfg.assignment was called with {nworld} and returned an array of shape "
+            f"{found.shape} and type {found.dtype}; it must return {nworld} whole numbers, the "
+            "index of each environment's variant."
+        )
+    outside = sorted({int(k) for k in found if not 0 <= k < len(names)})
+    if outside:
+        raise ValueError(
+            f"VariantEntityCfg.assignment returned the indices {outside}; the variants "
+            f"{list(names)} have the indices 0 to {len(names) - 1}."
+        )
+    return found.astype(np.int64)
+
+
+# Merging the specs of all variants.
+
+
+def _merge(
+    names: list[str],
+    specs: list[mujoco.MjSpec],
+    assignment: tuple[float, ...] | Callable[[int], Sequence[int]],
+) -> VariantMetadata:
+    """Turn the first spec into the merged one, and say what is in it."""
+    models = []
+    for name, spec in zip(names, specs, strict=True):
+        # A scene takes no notice of these settings of a part, and they would change what there is.
+        spec.compiler.discardvisual = False
+        spec.compiler.fusestatic = False
+        try:
+            models.append(compile_composed(spec))
+        except ValueError as error:
+            raise ValueError(f"Variant {name!r} does not compile: {error}") from error
+    source_specs = tuple(spec.copy() for spec in specs)
+    paths = [path for path, _ in walk_bodies(specs[0])]
+    bodies = [
+        list(group)
+        for group in zip(*([body for _, body in walk_bodies(spec)] for spec in specs), strict=True)
+    ]
+    split = [split_geoms(path, own, names) for path, own in zip(paths, bodies, strict=True)]
+    shared: list[Shared] = [group for own, _ in split for group in own]
+    slots = [slot for _, own in split for slot in own]
+    for k, (name, spec) in enumerate(zip(names, specs, strict=True)):
+        check_references(name, spec, slots, shared, k)
+    # By kind, the elements that all variants have, with their id in each.
+    groups: dict[str, list[Any]] = {"bodies": bodies, "geoms": shared}
+    elements = {}
+    for kind in _FIELD_PREFIXES:
+        if kind not in groups:
+            groups[kind] = list(zip(*(getattr(spec, kind) for spec in specs), strict=True))
+        elements[kind] = [
+            (group[0], [int(element.id) for element in group]) for group in groups[kind]
+        ]
+    slot_ids = [[-1 if geom is None else int(geom.id) for geom in slot.geoms] for slot in slots]
+    described = _describe(slots, len(names))
+    assets, geoms = merge_specs(names, specs, bodies, [own for _, own in split])
+    merged_geoms = [geom for own in geoms for geom in own]
+    elements["geoms"] += list(zip(merged_geoms, slot_ids, strict=True))
+    return VariantMetadata(
+        tuple(names),
+        assignment,
+        *described,
+        source_specs,
+        VariantTable(models, elements, assets),
+    )
+
+
+def _describe(slots: list[Slot], count: int) -> tuple[Any, Any]:
+    """Return the slots as metadata shows them, and what each variant has in them."""
+    ordered = sorted(slots, key=lambda s: (s.key.body_path, s.key.role != "visual", s.key.ordinal))
+    shown = tuple(
+        VariantSlot(
+            slot.key,
+            slot.key.name,
+            tuple(None if geom is None else geom.name or None for geom in slot.geoms),
+        )
+        for slot in ordered
+    )
+    specs = tuple(
+        tuple(
+            None if (geom := slot.geoms[k]) is None else VariantGeomSpec.of(geom)
+            for slot in ordered
+        )
+        for k in range(count)
+    )
+    return shown, specs
+
+
+# Values of each variant in the fields of a compiled model.
+
+# Kinds of elements, with the beginning of the names of their model fields.
+_FIELD_PREFIXES = {
+    "bodies": "body_",
+    "joints": "jnt_",
+    "geoms": "geom_",
+    "sites": "site_",
+    "cameras": "cam_",
+    "lights": "light_",
+    "tendons": "tendon_",
+    "actuators": "actuator_",
+    "equalities": "eq_",
+    "sensors": "sensor_",
+}
+
+# Real fields are figures. Of whole numbers, most are addresses; these are figures too.
+_WHOLE_FIGURES = frozenset(
+    {"jnt_limited", "jnt_actfrclimited", "jnt_actgravcomp", "site_type", "site_group", "cam_mode"}
+    | {"cam_projection", "cam_resolution", "light_mode", "light_type", "light_active"}
+    | {"light_castshadow", "tendon_limited", "tendon_actfrclimited", "actuator_ctrllimited"}
+    | {"actuator_forcelimited", "actuator_actlimited", "actuator_dyntype", "actuator_gaintype"}
+    | {"actuator_biastype", "actuator_actearly", "eq_active0"}
+)
+
+# These follow from the others, and are computed for the whole scene.
+_DERIVED = frozenset({"body_margin", "dof_length", "dof_M0", "actuator_length0"}) | (
+    frozenset((*FIXED_CONSTANTS, *CONSTANTS_AT_QPOS0)) - {"actuator_biasprm", "eq_data"}
+)
+
+# One row a control, or a force, of which an actuator may have several.
+_CONTROL_FIELDS = frozenset({"actuator_ctrllimited", "actuator_ctrlrange"})
+_FORCE_FIELDS = frozenset({"actuator_gear", "actuator_lengthrange"})
+_ASSET_FIELDS = {
+    "geom_matid": "materials",
+    "site_matid": "materials",
+    "tendon_matid": "materials",
+    "geom_dataid": "meshes",
+}
+
+# What a geom has where it is not there: no extent, no mesh, no colour. The rest stays as it is in
+# another variant.
+_ABSENT = {"geom_size": 0, "geom_rbound": 0, "geom_aabb": 0, "geom_dataid": -1, "geom_matid": -1}
+
+
+class VariantTable:
+    """Values of all variants, each compiled alone, with the merged elements that they are for."""
+
+    def __init__(
+        self,
+        models: list[mujoco.MjModel],
+        elements: dict[str, list[tuple[Any, list[int]]]],
+        assets: dict[str, list[list[Any]]],
+    ) -> None:
+        """Hold them.
+
+        Args:
+            models: Each variant compiled alone.
+            elements: By kind, elements of the merged spec, each with its id in every model; -1
+                where a variant does not have it. The first body is the root.
+            assets: By kind, for each variant, the merged element of each of its meshes and
+                materials.
+        """
+        self._models, self._elements, self._assets = models, elements, assets
+        self._root = elements["bodies"][0][0]
+
+    def columns(self, model: mujoco.MjModel) -> list[VariantColumns]:
+        """Return what each variant puts into `model`, compiled from a spec with the merged one."""
+        ids = {
+            kind: np.array(element_ids(model, kind, [e for e, _ in pairs]), dtype=int)
+            for kind, pairs in self._elements.items()
+        }
+        assets = {
+            field: [np.array([*element_ids(model, kind, own), -1]) for own in self._assets[kind]]
+            for field, kind in _ASSET_FIELDS.items()
+        }
+        return [self._columns_of(k, model, ids, assets) for k in range(len(self._models))]
+
+    def _columns_of(
+        self,
+        k: int,
+        model: mujoco.MjModel,
+        ids: dict[str, np.ndarray],
+        assets: dict[str, list[np.ndarray]],
+    ) -> VariantColumns:
+        fields: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        for kind, pairs in self._elements.items():
+            # Of what this variant does not have, the figures come from one that does.
+            sources = [
+                (k, own[k]) if own[k] >= 0 else next((j, i) for j, i in enumerate(own) if i >= 0)
+                for _, own in pairs
+            ]
+            for name in self._fields_of(kind):
+                values = [getattr(self._models[j], name)[i] for j, i in sources]
+                if name in assets:
+                    values = [assets[name][j][i] for (j, _), i in zip(sources, values, strict=True)]
+                if len(values):
+                    fields[name] = ids[kind], np.stack(values)
+        fields |= self._by_address(k, model, ids["joints"], ids["actuators"])
+        # Where the root starts is the entity's initial state, the same for all.
+        for name in ("body_pos", "body_quat"):
+            targets, values = fields[name]
+            fields[name] = targets[1:], values[1:]
+        absent = np.array([own[k] < 0 for _, own in self._elements["geoms"]], dtype=bool)
+        if absent.any():
+            for name, value in _ABSENT.items():
+                fields[name][1][absent] = value
+            fields["geom_rgba"][1][absent, 3] = 0.0
+        return VariantColumns(fields, ids["geoms"][absent])
+
+    def _fields_of(self, kind: str) -> list[str]:
+        """Return the fields with one row for each element of a kind, that hold figures."""
+        prefix, model = _FIELD_PREFIXES[kind], self._models[0]
+        names = [name for name in dir(model) if name.startswith(prefix)]
+        return [
+            name
+            for name in names
+            if isinstance(array := getattr(model, name), np.ndarray)
+            and name not in _DERIVED | _CONTROL_FIELDS | _FORCE_FIELDS
+            and (array.dtype.kind == "f" or name in _WHOLE_FIGURES or name in _ASSET_FIELDS)
+        ]
+
+    def _by_address(
+        self, k: int, model: mujoco.MjModel, joints: np.ndarray, actuators: np.ndarray
+    ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Return the fields with rows for degrees of freedom, positions, controls and forces."""
+        own = self._models[k]
+        there = [ids[k] for _, ids in self._elements["actuators"]]
+        places: dict[str, list[tuple[int, int]]] = {
+            kind: list(zip(columns(model, actuators), columns(own, there), strict=True))
+            for kind, columns in (("control", control_columns), ("force", force_columns))
+        }
+        places |= {"dof": [], "qpos": []}
+        for joint, (_, ids) in zip(joints, self._elements["joints"], strict=True):
+            kind, joint_there = int(model.jnt_type[joint]), ids[k]
+            for j in range(dof_width(kind)):
+                places["dof"].append((model.jnt_dofadr[joint] + j, own.jnt_dofadr[joint_there] + j))
+            if kind != mujoco.mjtJoint.mjJNT_FREE:
+                for j in range(qpos_width(kind)):
+                    places["qpos"].append(
+                        (model.jnt_qposadr[joint] + j, own.jnt_qposadr[joint_there] + j)
+                    )
+        names = {"qpos0": "qpos", "qpos_spring": "qpos"}
+        names |= {name: "dof" for name in dir(own) if name.startswith("dof_")}
+        names |= dict.fromkeys(_CONTROL_FIELDS, "control") | dict.fromkeys(_FORCE_FIELDS, "force")
+        fields = {}
+        for name, kind in names.items():
+            array = getattr(own, name)
+            is_figure = array.dtype.kind == "f" or name in _WHOLE_FIGURES
+            if places[kind] and is_figure and name not in _DERIVED:
+                here, rows = np.array(places[kind], dtype=int).T
+                fields[name] = here, array[rows]
+        return fields

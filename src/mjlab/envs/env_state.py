@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.managers.manager_base import NullManager
 from mjlab.utils.state import capture_state, restore_state, shape_differences
 
 if TYPE_CHECKING:
@@ -69,7 +70,14 @@ def _check_fits(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
             f"{env.num_envs}. Resume with --num-envs {state['num_envs']} to continue exactly."
         )
     env.sim.check_state(state["sim"])
-    _check_terrain(env, state.get("terrain"))
+    saved, here = state.get("terrain"), _terrain_measures(env)
+    if saved is not None and here is not None:
+        same = saved.shape == here.shape and torch.allclose(saved.cpu(), here, rtol=1e-6)
+        if not same:
+            raise ValueError(
+                "The saved environments stand on another terrain than these. Terrain follows from "
+                "the seed: resume with the seed and the terrain settings of the run that saved them."
+            )
     current = state_dict(env)
     differences = [
         f"{manager} had the terms {state['terms'].get(manager)} and has {current['terms'].get(manager)}"
@@ -81,18 +89,6 @@ def _check_fits(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
         more = f"; and {len(differences) - 5} more" if len(differences) > 5 else ""
         raise ValueError(
             "The task is not the one that was saved: " + "; ".join(differences[:5]) + more + "."
-        )
-
-
-def _check_terrain(env: ManagerBasedRlEnv, saved: torch.Tensor | None) -> None:
-    """Raise ValueError if the saved environments stood on another generated terrain."""
-    here = _terrain_measures(env)
-    if saved is None or here is None:
-        return
-    if saved.shape != here.shape or not torch.allclose(saved.cpu(), here, rtol=1e-6):
-        raise ValueError(
-            "The saved environments stand on another terrain than these. Terrain follows from the "
-            "seed: resume with the seed and the terrain settings of the run that saved them."
         )
 
 
@@ -125,8 +121,7 @@ def _terms(env: ManagerBasedRlEnv) -> dict[str, Any]:
 
 
 def _managers(env: ManagerBasedRlEnv) -> list[str]:
-    # Null managers have no state and are not marked stateful.
-    return [name for name in _MANAGERS if not type(getattr(env, name)).__name__.startswith("Null")]
+    return [name for name in _MANAGERS if not isinstance(getattr(env, name), NullManager)]
 
 
 def _cloned(observations: dict[str, Any]) -> dict[str, Any]:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import logging
 import math
 from collections.abc import Generator
 from dataclasses import dataclass, field
-from numbers import Integral, Real
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -52,6 +51,7 @@ from mjlab.sim.engine import resolve_engine_name
 from mjlab.sim.memory import LEAST_BYTES, check_memory
 from mjlab.sim.simulation import Simulation
 from mjlab.utils import spaces
+from mjlab.utils.errors import UnsupportedError, WrongStateError, check_count
 from mjlab.utils.indexing import as_ids
 from mjlab.utils.random import draw_seed, seed_rng
 from mjlab.viewer.viewer_config import ViewerConfig
@@ -59,15 +59,6 @@ from mjlab.viewer.viewer_config import ViewerConfig
 if TYPE_CHECKING:
     from mjlab.viewer.debug_visualizer import DebugVisualizer
     from mjlab.viewer.offscreen_renderer import OffscreenRenderer
-
-
-# MERGED mjlab.envs.manager_based_rl_env: The configuration of an environment: everything that makes up a task.
-
-
-def _default_events() -> dict[str, EventTermCfg | None]:
-    return {
-        "reset_scene_to_default": EventTermCfg(func=reset_scene_to_default, mode="reset"),
-    }
 
 
 @dataclass(kw_only=True)
@@ -85,7 +76,11 @@ class ManagerBasedRlEnvCfg:
     """Observation groups by name, such as `actor` and `critic`."""
     actions: dict[str, ActionTermCfg | None] = field(default_factory=dict)
     """Action terms; their order is the order of the action vector."""
-    events: dict[str, EventTermCfg | None] = field(default_factory=_default_events)
+    events: dict[str, EventTermCfg | None] = field(
+        default_factory=lambda: {
+            "reset_scene_to_default": EventTermCfg(func=reset_scene_to_default, mode="reset")
+        }
+    )
     """What happens at startup, reset, intervals or every step. By default a reset puts the scene
     into its default state; an empty dict resets to the model's `qpos0` only."""
     seed: int | None = None
@@ -114,148 +109,6 @@ class ManagerBasedRlEnvCfg:
     """Whether `step` resets environments that are done."""
     scale_rewards_by_dt: bool = True
     """Whether rewards are multiplied by the environment step, in seconds."""
-
-
-# MERGED mjlab.envs.manager_based_rl_env: Checks of what an environment is given: config and device, actions, environments to reset.
-
-
-def check_env_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
-    """Refuse values that could only fail later.
-
-    Raises:
-        ValueError: naming the field, what was given and what is allowed.
-    """
-    if not _is_count(cfg.scene.num_envs):
-        raise ValueError(
-            f"scene.num_envs is {cfg.scene.num_envs!r}; the number of environments has to be a "
-            "whole number, at least 1 (--num-envs 4096, say)."
-        )
-    if not _is_count(cfg.decimation):
-        raise ValueError(
-            f"decimation is {cfg.decimation!r}; it has to be a whole number of physics substeps, "
-            "at least 1."
-        )
-    timestep = cfg.sim.mujoco.timestep
-    if not (isinstance(timestep, Real) and timestep > 0):
-        raise ValueError(f"sim.mujoco.timestep is {timestep!r}; it has to be positive (seconds).")
-    for name, entity in cfg.scene.entities.items():
-        if entity is None:
-            raise ValueError(
-                f"scene.entities[{name!r}] is None; an entity cannot be switched off like a term. "
-                f"Give an EntityCfg, or remove it: del cfg.scene.entities[{name!r}]."
-            )
-    _check_episode_length(cfg)
-
-
-def check_device(device: Any) -> None:
-    """Refuse a device on which no tensor could be made.
-
-    Raises:
-        ValueError: no name of a CPU or CUDA device, or a CUDA device that is not there.
-    """
-    allowed = "Use 'cpu', 'cuda', or 'cuda:<index>'."
-    try:
-        parsed = torch.device(device) if isinstance(device, str) else None
-    except RuntimeError:
-        parsed = None
-    if parsed is None or parsed.type not in ("cpu", "cuda"):
-        raise ValueError(f"device is {device!r}, which is not a device name. {allowed}")
-    if parsed.type != "cuda":
-        return
-    if not torch.cuda.is_available():
-        raise ValueError(
-            f"device is {device!r}, but PyTorch finds no CUDA here. Use 'cpu', or install an "
-            "NVIDIA driver and a PyTorch with CUDA."
-        )
-    count = torch.cuda.device_count()
-    if (parsed.index or 0) >= count:
-        raise ValueError(
-            f"device is {device!r}, but the indices of the GPUs here are 0 to {count - 1}."
-        )
-
-
-def as_action(action: Any, device: str) -> torch.Tensor:
-    """Return an action as a tensor on `device`; arrays and lists of numbers become float32.
-
-    Raises:
-        ValueError: it is neither a tensor nor an array of numbers.
-        TypeError: it is a tensor of complex numbers, or without data.
-    """
-    if isinstance(action, torch.Tensor):
-        check_real("The action", action)
-        return action.to(device)
-    try:
-        # Copied, because torch warns about arrays that it may not write to.
-        return torch.as_tensor(np.array(action), dtype=torch.float32, device=device)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(
-            f"The action is a {type(action).__name__} that does not convert to a tensor ({error}). "
-            "Give a float tensor, array or list of shape (environments, components)."
-        ) from error
-
-
-def as_reset_ids(env_ids: Any, num_envs: int, device: str) -> torch.Tensor:
-    """Return the environments to reset as a 1-D int64 tensor on `device`.
-
-    Args:
-        env_ids: None for all, a slice, a bool mask (num_envs,), or indices in any integer type.
-        num_envs: Number of environments.
-        device: Device of the result.
-
-    Raises:
-        ValueError: a mask of another length, indices that are no integers or out of range.
-    """
-    if env_ids is None or isinstance(env_ids, slice):
-        return as_ids(env_ids, num_envs, device)
-    expected = (
-        f"env_ids must be integers from 0 to {num_envs - 1}, a bool mask of length {num_envs}, a "
-        "slice, or None for all environments"
-    )
-    try:
-        ids = torch.as_tensor(env_ids, device=device).flatten()
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{expected}; got {env_ids!r}.") from error
-    if ids.dtype == torch.bool:
-        if len(ids) != num_envs:
-            raise ValueError(f"{expected}; got a mask of length {len(ids)}.")
-        return ids.nonzero().flatten()
-    # An empty list becomes a float tensor.
-    if ids.numel() == 0:
-        return ids.long()
-    if ids.is_floating_point() or ids.is_complex():
-        raise ValueError(f"{expected}; got numbers of type {ids.dtype}.")
-    ids = ids.long()
-    wrong = ids[(ids < 0) | (ids >= num_envs)]
-    if len(wrong) > 0:
-        raise ValueError(f"{expected}; got {wrong[:10].tolist()}{' ...' * (len(wrong) > 10)}.")
-    return ids
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, Integral) and not isinstance(value, bool) and value >= 1
-
-
-def _check_episode_length(cfg: ManagerBasedRlEnvCfg) -> None:
-    length = cfg.episode_length_s
-    if not (isinstance(length, Real) and math.isfinite(length) and length >= 0):
-        raise ValueError(
-            f"episode_length_s is {length!r}; it has to be a finite number of seconds and cannot "
-            "be negative."
-        )
-    if length == 0:
-        names = [
-            name
-            for name, term in cfg.terminations.items()
-            if term is not None and term.func is time_out
-        ]
-        if names:
-            raise ValueError(
-                f"episode_length_s is 0, so the termination {names[0]!r} would fire at every step. "
-                "Set episode_length_s to the length of an episode in seconds, or remove the term."
-            )
-
-
-logger = logging.getLogger(__name__)
 
 
 class ManagerBasedRlEnv:
@@ -302,7 +155,14 @@ class ManagerBasedRlEnv:
         # Origins are made with the scene, before the sizes of the model are known.
         check_memory(cfg.scene.num_envs, LEAST_BYTES, device)
         self.scene = Scene(cfg.scene, device=device)
-        self.sim = self._create_simulation()
+        self.scene.report_overruled_options(cfg.sim.mujoco)
+        self.sim = Simulation(
+            self.num_envs,
+            cfg.sim,
+            device=device,
+            spec=self.scene.spec,
+            variant_info=self.scene.collect_variant_info(),
+        )
         self.scene.initialize(self.sim.mj_model, self.sim.model, self.sim.data)
         self.sim.add_forward_callback(self.scene.invalidate_sensor_caches)
         if self.scene.sensor_context is not None:
@@ -317,8 +177,8 @@ class ManagerBasedRlEnv:
         self.diverged = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
         self._nan_resets = torch.zeros(self.num_envs, dtype=torch.long, device=device)
         self._divergence_log = DivergenceLog(self.sim)
-        # What `_command_dt` returns in a step with resets. Kept, because torch counts no writes to a
-        # tensor made under `inference_mode`, and by these a `Lookup` knows that it is valid.
+        # Time that passes for commands in a step with resets. Kept, because torch counts no writes to
+        # a tensor made under `inference_mode`, and by these a `Lookup` knows that it is valid.
         self._command_dts = torch.zeros(self.num_envs, dtype=torch.float32, device=device)
         self._ended, self._observed = Lookup(), Lookup()
         self._looks_ahead = torch.device(device).type == "cuda"
@@ -333,7 +193,7 @@ class ManagerBasedRlEnv:
         self.setup_manager_visualizers()
         self.sensor_visualizers = SensorSwitches(self.scene.sensors)
 
-    # What there is.
+    # Properties.
 
     @property
     def num_envs(self) -> int:
@@ -378,16 +238,6 @@ class ManagerBasedRlEnv:
         return self
 
     # Construction.
-
-    def _create_simulation(self) -> Simulation:
-        self.scene.report_overruled_options(self.cfg.sim.mujoco)
-        return Simulation(
-            self.num_envs,
-            self.cfg.sim,
-            device=self._device,
-            spec=self.scene.spec,
-            variant_info=self.scene.collect_variant_info(),
-        )
 
     def _create_renderer(self) -> OffscreenRenderer:
         from mjlab.viewer.offscreen_renderer import OffscreenRenderer
@@ -544,8 +394,12 @@ class ManagerBasedRlEnv:
             ValueError: an action of another shape, of no numbers, or one that is not finite.
             RuntimeError: without `auto_reset`, an environment that is done was not reset.
         """
-        if not self.cfg.auto_reset:
-            self._refuse_pending_resets()
+        if not self.cfg.auto_reset and self._pending_reset.any():
+            ids = self._pending_reset.nonzero().flatten().tolist()
+            raise WrongStateError(
+                f"Environments {ids[:10]}{' ...' if len(ids) > 10 else ''} are done and were not "
+                "reset. Call env.reset(env_ids=...) first, or set auto_reset=True in the config."
+            )
         self._clear_extras()
         self.action_manager.process_action(as_action(action, self.device))
         self._run_physics()
@@ -553,19 +407,7 @@ class ManagerBasedRlEnv:
         if not self._holds_common_steps:
             self.common_step_counter += 1
 
-        self.diverged.copy_(self.sim.bad_states())
-        for manager in (self.termination_manager, self.reward_manager):
-            manager.nonfinite.begin_step(self.diverged, self.common_step_counter)
-        self.reset_buf = self.termination_manager.compute()
-        self.reset_terminated = self.termination_manager.terminated
-        self.reset_time_outs = self.termination_manager.time_outs
-        self._terminate_diverged()
-        self.reward_buf = self.reward_manager.compute(dt=self.step_dt)
-        # Also what a subclass of the manager adds.
-        self.reward_buf.masked_fill_(self.diverged, 0.0)
-        self._log_not_finite()
-        self.metrics_manager.excluded = self.diverged
-        self.metrics_manager.compute()
+        self._evaluate_step()
         self._look_ahead()
         self._divergence_log.end_step(self.diverged, self.common_step_counter)
         for mode in ("step", "interval"):
@@ -576,10 +418,13 @@ class ManagerBasedRlEnv:
         if self.observes_ends and self.cfg.auto_reset:
             self._observe_ends(moved)
         reset_ids = self._reset_done_envs()
-        command_dt = self._command_dt(reset_ids)
-        if self._looks_ahead and len(reset_ids) > 0:
-            # Resets redrew their timers. Here the GPU has less left to do than after `forward`.
-            look_up(self.command_manager.plan_lookups(command_dt))
+        command_dt: float | torch.Tensor = self.step_dt
+        if len(reset_ids) > 0:
+            # No time has passed for commands where an episode has just begun.
+            command_dt = self._command_dts.fill_(command_dt).index_fill_(0, reset_ids, 0.0)
+            if self._looks_ahead:
+                # Resets redrew their timers. Here the GPU has less left to do than after `forward`.
+                look_up(self.command_manager.plan_lookups(command_dt))
         self._forward(reset_ids, moved)
         self._compute_commands(dt=command_dt)
         self.sim.sense()
@@ -610,6 +455,10 @@ class ManagerBasedRlEnv:
         finally:
             self._holds_common_steps = held
 
+    def get_observations(self) -> VecEnvObs:
+        """Return the observations of the last step or reset."""
+        return self.observation_manager.compute()
+
     def _run_physics(self) -> None:
         self._divergence_log.begin_step()
         substeps = self.cfg.decimation
@@ -629,17 +478,26 @@ class ManagerBasedRlEnv:
             self.scene.update(dt=self.physics_dt)
             self.metrics_manager.compute_substep()
 
-    def _terminate_diverged(self) -> None:
-        """End the episode of environments whose physics diverged, and count them."""
+    def _evaluate_step(self) -> None:
+        """Compute terminations, rewards and metrics; end the episodes whose physics diverged."""
+        self.diverged.copy_(self.sim.bad_states())
+        for manager in (self.termination_manager, self.reward_manager):
+            manager.nonfinite.begin_step(self.diverged, self.common_step_counter)
+        self.reset_buf = self.termination_manager.compute()
+        self.reset_terminated = self.termination_manager.terminated
+        self.reset_time_outs = self.termination_manager.time_outs
         self.reset_terminated |= self.diverged
         self.reset_buf |= self.diverged
         self._nan_resets += self.diverged
-
-    def _log_not_finite(self) -> None:
+        self.reward_buf = self.reward_manager.compute(dt=self.step_dt)
+        # Also what a subclass of the manager adds.
+        self.reward_buf.masked_fill_(self.diverged, 0.0)
         log = self.extras["log"]
         log["Simulation/nan_resets"] = self.diverged.sum()
         log["Simulation/nan_rewards"] = self.reward_manager.nonfinite.count
         log["Simulation/nan_terminations"] = self.termination_manager.nonfinite.count
+        self.metrics_manager.excluded = self.diverged
+        self.metrics_manager.compute()
 
     def _look_ahead(self) -> None:
         """On a GPU, look up in one wait which environments end, and are due for events and commands.
@@ -738,20 +596,6 @@ class ManagerBasedRlEnv:
         # What resets placed is current by now, and commands see to what they place by themselves.
         self.scene.take_moved_envs()
 
-    def _command_dt(self, reset_ids: torch.Tensor) -> float | torch.Tensor:
-        """Return the time that passed for commands: none where an episode has just begun."""
-        if len(reset_ids) == 0:
-            return self.step_dt
-        return self._command_dts.fill_(self.step_dt).index_fill_(0, reset_ids, 0.0)
-
-    def _refuse_pending_resets(self) -> None:
-        if self._pending_reset.any():
-            ids = self._pending_reset.nonzero().flatten().tolist()
-            raise RuntimeError(
-                f"Environments {ids[:10]}{' ...' if len(ids) > 10 else ''} are done and were not "
-                "reset. Call env.reset(env_ids=...) first, or set auto_reset=True in the config."
-            )
-
     def _reset_idx(self, env_ids: torch.Tensor) -> None:
         # The curriculum runs first, because it judges the state in which the episode ended.
         self.curriculum_manager.compute(env_ids=env_ids)
@@ -780,10 +624,6 @@ class ManagerBasedRlEnv:
         self.episode_length_buf[env_ids] = 0
         self._pending_reset[env_ids] = False
 
-    def get_observations(self) -> VecEnvObs:
-        """Return the observations of the last step or reset."""
-        return self.observation_manager.compute()
-
     # Seeds, rendering, saving, closing.
 
     @staticmethod
@@ -805,7 +645,7 @@ class ManagerBasedRlEnv:
         if self.render_mode in (None, "human"):
             return None
         if self.render_mode != "rgb_array" or self._renderer is None:
-            raise NotImplementedError(
+            raise UnsupportedError(
                 f"Render mode {self.render_mode!r} is not supported; use 'rgb_array' or None."
             )
         # Opened late, so that a machine that cannot render can still train.
@@ -835,3 +675,115 @@ class ManagerBasedRlEnv:
             self._renderer = None
         self.recorder_manager.close()
         self.sim.close()
+
+
+def check_env_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
+    """Refuse values that could only fail later.
+
+    Raises:
+        ValueError: naming the field, what was given and what is allowed.
+    """
+    check_count("scene.num_envs", cfg.scene.num_envs)
+    check_count("decimation", cfg.decimation)
+    timestep = cfg.sim.mujoco.timestep
+    if not (isinstance(timestep, Real) and timestep > 0):
+        raise ValueError(f"sim.mujoco.timestep: expected a number > 0 (s), got {timestep!r}.")
+    for name, entity in cfg.scene.entities.items():
+        if entity is None:
+            raise ValueError(
+                f"scene.entities[{name!r}] is None; an entity cannot be switched off like a term. "
+                f"Give an EntityCfg, or remove it: del cfg.scene.entities[{name!r}]."
+            )
+    length = cfg.episode_length_s
+    if not (isinstance(length, Real) and math.isfinite(length) and length >= 0):
+        raise ValueError(f"episode_length_s: expected a finite number >= 0 (s), got {length!r}.")
+    for name, term in cfg.terminations.items():
+        if length == 0 and term is not None and term.func is time_out:
+            raise ValueError(
+                f"episode_length_s is 0, so the termination {name!r} would fire at every step. "
+                "Set episode_length_s to the length of an episode in seconds, or remove the term."
+            )
+
+
+def check_device(device: Any) -> None:
+    """Refuse a device on which no tensor could be made.
+
+    Raises:
+        ValueError: no name of a CPU or CUDA device, or a CUDA device that is not there.
+    """
+    allowed = "Use 'cpu', 'cuda', or 'cuda:<index>'."
+    try:
+        parsed = torch.device(device) if isinstance(device, str) else None
+    except RuntimeError:
+        parsed = None
+    if parsed is None or parsed.type not in ("cpu", "cuda"):
+        raise ValueError(f"device is {device!r}, which is not a device name. {allowed}")
+    if parsed.type != "cuda":
+        return
+    if not torch.cuda.is_available():
+        raise ValueError(
+            f"device is {device!r}, but PyTorch finds no CUDA here. Use 'cpu', or install an "
+            "NVIDIA driver and a PyTorch with CUDA."
+        )
+    count = torch.cuda.device_count()
+    if (parsed.index or 0) >= count:
+        raise ValueError(
+            f"device is {device!r}, but the indices of the GPUs here are 0 to {count - 1}."
+        )
+
+
+def as_action(action: Any, device: str) -> torch.Tensor:
+    """Return an action as a tensor on `device`; arrays and lists of numbers become float32.
+
+    Raises:
+        ValueError: it is neither a tensor nor an array of numbers.
+        TypeError: it is a tensor of complex numbers, or without data.
+    """
+    if isinstance(action, torch.Tensor):
+        check_real(action, str, "The action")
+        return action.to(device)
+    try:
+        # Copied, because torch warns about arrays that it may not write to.
+        return torch.as_tensor(np.array(action), dtype=torch.float32, device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(
+            f"The action is a {type(action).__name__} that does not convert to a tensor ({error}). "
+            "Give a float tensor, array or list of shape (environments, components)."
+        ) from error
+
+
+def as_reset_ids(env_ids: Any, num_envs: int, device: str) -> torch.Tensor:
+    """Return the environments to reset as a 1-D int64 tensor on `device`.
+
+    Args:
+        env_ids: None for all, a slice, a bool mask (num_envs,), or indices in any integer type.
+        num_envs: Number of environments.
+        device: Device of the result.
+
+    Raises:
+        ValueError: a mask of another length, indices that are no integers or out of range.
+    """
+    if env_ids is None or isinstance(env_ids, slice):
+        return as_ids(env_ids, num_envs, device)
+    expected = (
+        f"env_ids must be integers from 0 to {num_envs - 1}, a bool mask of length {num_envs}, a "
+        "slice, or None for all environments"
+    )
+    try:
+        ids = torch.as_tensor(env_ids, device=device).flatten()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{expected}; got {env_ids!r}.") from error
+    if ids.dtype == torch.bool:
+        if len(ids) != num_envs:
+            raise ValueError(f"{expected}; got a mask of length {len(ids)}.")
+        return ids.nonzero().flatten()
+    # An empty list becomes a float tensor.
+    if ids.numel() == 0:
+        return ids.long()
+    if ids.is_floating_point() or ids.is_complex():
+        raise ValueError(f"{expected}; got numbers of type {ids.dtype}.")
+    ids = ids.long()
+    wrong = ids[(ids < 0) | (ids >= num_envs)]
+    if len(wrong) > 0:
+        raise ValueError(f"{expected}; got {wrong[:10].tolist()}{' ...' * (len(wrong) > 10)}.")
+    return ids

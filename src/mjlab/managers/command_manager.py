@@ -15,9 +15,10 @@ from mjlab.managers.manager_base import (
     BuiltTermsManager,
     DebugVisSwitches,
     ManagerTermBase,
-    finite_mean,
+    NullManager,
 )
-from mjlab.managers.null_managers import NullCommandManager as NullCommandManager
+from mjlab.managers.nonfinite import finite_mean
+from mjlab.utils.errors import UnsupportedError
 from mjlab.utils.indexing import as_ids, is_empty
 
 if TYPE_CHECKING:
@@ -65,7 +66,12 @@ class CommandTerm(ManagerTermBase):
     def __init__(self, cfg: CommandTermCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(env)
         self.cfg = cfg
-        self._check()
+        low, high = cfg.resampling_time_range
+        if not 0.0 <= low <= high:
+            raise ValueError(
+                f"{self.name} resampling_time_range: expected 0 <= shortest <= longest (s), got "
+                f"{(low, high)}."
+            )
         self.metrics: dict[str, torch.Tensor] = {}
         self.time_left = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self.command_counter = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
@@ -74,7 +80,7 @@ class CommandTerm(ManagerTermBase):
     @property
     def command(self) -> Any:
         """The current command, (num_envs, ...)."""
-        raise NotImplementedError(f"{self.name} must define the property command.")
+        raise UnsupportedError(f"{self.name} must define the property command.")
 
     def export_metadata(self, name: str) -> dict[str, list | str | float]:
         """Return metadata from which a deployment can generate the command; empty by default.
@@ -105,7 +111,14 @@ class CommandTerm(ManagerTermBase):
                     f"{self.name}.compute: with env_ids, dt must be one number, got shape "
                     f"{tuple(dt.shape)}."
                 )
-            self._update_metrics_of(env_ids)
+            # `_update_metrics` knows only all environments; one that accumulates would count a step
+            # that the others have not made, so their values are put back.
+            before = {name: (values, values.clone()) for name, values in self.metrics.items()}
+            self._update_metrics()
+            for name, (values, kept) in before.items():
+                kept[env_ids] = self.metrics[name][env_ids]
+                # Also where the update put another tensor in place of the old one.
+                self.metrics[name] = values.copy_(kept)
             self.time_left[env_ids] -= dt
             due = env_ids[self.time_left[env_ids] <= 0.0]
         if len(due) > 0:
@@ -182,7 +195,7 @@ class CommandTerm(ManagerTermBase):
 
     def _resample_command(self, env_ids: torch.Tensor) -> None:
         """Draw commands for these environments (1-D int64)."""
-        raise NotImplementedError(f"{self.name} must define _resample_command(env_ids).")
+        raise UnsupportedError(f"{self.name} must define _resample_command(env_ids).")
 
     def _update_command(self, env_ids: torch.Tensor | None = None) -> None:
         """Update commands that depend on the state; None means all environments."""
@@ -196,27 +209,6 @@ class CommandTerm(ManagerTermBase):
 
     def _debug_vis_impl(self, visualizer: DebugVisualizer) -> None:
         """Draw the command."""
-
-    def _update_metrics_of(self, env_ids: torch.Tensor) -> None:
-        """Update the metrics of some environments only.
-
-        `_update_metrics` knows only all of them; one that accumulates would count a step that the
-        others have not made, so their values are put back.
-        """
-        before = {name: (values, values.clone()) for name, values in self.metrics.items()}
-        self._update_metrics()
-        for name, (values, kept) in before.items():
-            kept[env_ids] = self.metrics[name][env_ids]
-            # Also where the update put another tensor in place of the old one.
-            self.metrics[name] = values.copy_(kept)
-
-    def _check(self) -> None:
-        low, high = self.cfg.resampling_time_range
-        if not 0.0 <= low <= high:
-            raise ValueError(
-                f"{self.name}: resampling_time_range is {(low, high)}; these are times in seconds, "
-                "so they must not be negative, nor the first larger than the second."
-            )
 
 
 class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
@@ -251,8 +243,7 @@ class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
 
     def get_term_cfg(self, name: str) -> CommandTermCfg:
         """Return the live config of a command; raises `ValueError` if unknown."""
-        if name not in self._terms:
-            self._unknown(name, self.active_terms, ValueError)
+        self._check_known(name, self.active_terms)
         return self._terms[name].cfg
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
@@ -289,3 +280,12 @@ class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
     def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
         rows = [(name, type(term).__name__) for name, term in self._terms.items()]
         return ["name", "type"], rows
+
+
+class NullCommandManager(NullManager, CommandManager):
+    """Command manager without terms: `get_command`, `get_term` and `get_term_cfg` return None."""
+
+    def get_command(self, name: str) -> None:  # ty: ignore
+        """Return None."""
+
+    get_term = get_term_cfg = get_command  # ty: ignore

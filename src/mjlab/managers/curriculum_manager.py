@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
-from mjlab.managers.null_managers import NullCurriculumManager as NullCurriculumManager
+from mjlab.managers.manager_base import ManagerTermBaseCfg, NullManager, TermListManager
 from mjlab.utils.indexing import as_index
 
 if TYPE_CHECKING:
@@ -42,7 +41,14 @@ class CurriculumManager(TermListManager):
         index = as_index(env_ids)
         for name, cfg in zip(self._term_names, self._term_cfgs, strict=True):
             state = cfg.func(self._env, index, **cfg.params)
-            self._check_state(name, state)
+            for key, value in state.items() if isinstance(state, dict) else [(None, state)]:
+                if isinstance(value, torch.Tensor) and value.numel() != 1:
+                    where = "" if key is None else f", key {key!r}"
+                    raise ValueError(
+                        f"{self._label(name)}{where}: returned a tensor of shape "
+                        f"{tuple(value.shape)}, but what is logged must be one number. Reduce it "
+                        "(mean, max) in the term, or return a dict of numbers."
+                    )
             self._state[name] = state
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, float]:
@@ -69,16 +75,9 @@ class CurriculumManager(TermListManager):
             terms.append((name, [float(_number(v)) for v in values if v is not None]))
         return terms
 
-    def _check_state(self, name: str, state: Any) -> None:
-        items = state.items() if isinstance(state, dict) else [(None, state)]
-        for key, value in items:
-            if isinstance(value, torch.Tensor) and value.numel() != 1:
-                where = "" if key is None else f", key {key!r}"
-                raise ValueError(
-                    f"{self._label(name)}{where}: returned a tensor of shape {tuple(value.shape)}, "
-                    "but what is logged must be one number. Reduce it (mean, max) in the term, or "
-                    "return a dict of numbers."
-                )
+
+class NullCurriculumManager(NullManager, CurriculumManager):
+    """Curriculum manager without terms."""
 
 
 def _number(value: Any) -> Any:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import logging
+import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Real
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 import torch
@@ -14,79 +15,17 @@ from mjlab.compat import accepts_older_fields
 from mjlab.managers.lookup import Lookup
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermFunctionSwitches, TermListManager
 from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.managers.term_checks import is_interval
 from mjlab.sim.randomization import RecomputeLevel
+from mjlab.utils.errors import check_one_of
 from mjlab.utils.indexing import as_ids, is_empty
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
 
-# MERGED mjlab.managers.event_manager: What a function that changes the model declares: its fields, and what must be recomputed.
-
-F = TypeVar("F", bound=Callable[..., Any])
-_DERIVED = {
-    RecomputeLevel.set_const_fixed: ("body_subtreemass",),
-    RecomputeLevel.set_const_0: (
-        "dof_invweight0",
-        "body_invweight0",
-        "tendon_length0",
-        "tendon_invweight0",
-        "actuator_acc0",
-    ),
-}
-
-
-def derived_fields(level: RecomputeLevel) -> tuple[str, ...]:
-    """Return the model fields that recomputing at this level writes."""
-    return tuple(f for part, fields in _DERIVED.items() if level & part for f in fields)
-
-
-def join_levels(levels: Iterable[RecomputeLevel]) -> RecomputeLevel:
-    """Return the level that recomputes what any of the given ones does."""
-    joined = 0
-    for level in levels:
-        joined |= level
-    return RecomputeLevel(joined)
-
-
-def requires_model_fields(
-    *fields: str, recompute: RecomputeLevel = RecomputeLevel.none
-) -> Callable[[F], F]:
-    """Declare that a function or class, used as an event, changes these fields of the model.
-
-    The fields, and those that derive from them at the level `recompute`, then get a value for each
-    environment, and the latter are recomputed after the event has fired.
-    """
-
-    def declare(function: F) -> F:
-        declared = dict.fromkeys((*fields, *derived_fields(recompute)))
-        setattr(function, "model_fields", tuple(declared))  # noqa: B010
-        setattr(function, "recompute", RecomputeLevel(recompute))  # noqa: B010
-        return function
-
-    return declare
-
-
-def declared_model_fields(function: Any, params: dict[str, Any]) -> tuple[str, ...]:
-    """Return the model fields that an event's function declares.
-
-    A function that learns from its parameters which field it changes declares a callable instead,
-    which gets the parameters: `function.model_fields(params)`. So may `recompute`.
-    """
-    return tuple(_declared(function, "model_fields", params, ()))
-
-
-def declared_recompute(function: Any, params: dict[str, Any]) -> RecomputeLevel:
-    """Return the level of recomputation that an event's function declares."""
-    return RecomputeLevel(_declared(function, "recompute", params, RecomputeLevel.none))
-
-
-def _declared(function: Any, name: str, params: dict[str, Any], default: Any) -> Any:
-    value = getattr(function, name, default)
-    return value(params) if callable(value) else value
-
-
 logger = logging.getLogger(__name__)
+F = TypeVar("F", bound=Callable[..., Any])
 EventMode = Literal["startup", "reset", "interval", "step"]
 
 # Timers count down in steps, so that rounding must not put an event off by one.
@@ -137,7 +76,23 @@ class EventManager(TermFunctionSwitches, TermListManager):
         self._last_reset_step: dict[str, torch.Tensor] = {}
         for name, term in zip(self._term_names, self._term_cfgs, strict=True):
             self._terms_by_mode.setdefault(term.mode, []).append((name, term))
-            self._prepare_time(name, term)
+            if term.mode == "reset":
+                never = torch.full((self.num_envs,), _NEVER, dtype=torch.long, device=self.device)
+                self._last_reset_step[name] = never
+            bounds = term.interval_range_s
+            is_missing = bounds is None and term.mode == "interval"
+            if is_missing or (bounds is not None and not (is_interval(bounds) and bounds[0] >= 0)):
+                raise ValueError(
+                    f"{self._label(name)} interval_range_s: expected (shortest, longest) in "
+                    f"seconds, with 0 <= shortest <= longest, got {bounds!r}."
+                )
+            if term.mode == "interval":
+                self._lookups[name] = Lookup()
+                if term.is_global_time:
+                    # On the host, which would wait for a number drawn on a GPU.
+                    self._timers[name] = self._draw(term, 1, "cpu").item()
+                else:
+                    self._timers[name] = self._draw(term, self.num_envs)
 
     @property
     def active_terms(self) -> dict[str, list[str]]:  # ty: ignore[incompatible-property-override]
@@ -152,17 +107,13 @@ class EventManager(TermFunctionSwitches, TermListManager):
     @property
     def domain_randomization_fields(self) -> tuple[str, ...]:
         """Model fields that need a value for each environment, without repetition."""
-        fields = (
-            field
-            for cfg in self._term_cfgs
-            for field in declared_model_fields(cfg.func, cfg.params)
-        )
+        fields = (field for cfg in self._term_cfgs for field in declared(cfg, "model_fields", ()))
         return tuple(dict.fromkeys(fields))
 
     @property
     def recompute_level(self) -> RecomputeLevel:
         """Level that recomputes what any of the events changes."""
-        return join_levels(declared_recompute(cfg.func, cfg.params) for cfg in self._term_cfgs)
+        return joint_level(self._term_cfgs)
 
     def apply(
         self,
@@ -184,21 +135,32 @@ class EventManager(TermFunctionSwitches, TermListManager):
 
         Raises `ValueError` if an argument is missing or out of place, or the mode is unknown.
         """
-        _check_arguments(mode, env_ids, dt, global_env_step_count)
-        levels, reset_ids = [], None
+        check_one_of("Event mode", mode, get_args(EventMode))
+        if mode in ("interval", "step") and dt is None:
+            raise ValueError(f"Events of mode {mode!r} need dt, the seconds since the last call.")
+        if mode == "interval" and env_ids is not None:
+            raise ValueError(
+                "Events of mode 'interval' take no env_ids: each environment has its timer."
+            )
+        if mode == "reset" and (env_ids is None or global_env_step_count is None):
+            raise ValueError(
+                "Events of mode 'reset' need env_ids, the environments that reset, and "
+                "global_env_step_count, the environment steps so far."
+            )
+        fired, reset_ids = [], None
         if mode == "reset":
             reset_ids = as_ids(env_ids, self.num_envs, self.device)
         for name, cfg in self._terms_by_mode.get(mode, ()):
             if mode == "interval":
-                fired = self._apply_interval(name, cfg, dt or 0.0)
+                is_due = self._apply_interval(name, cfg, dt or 0.0)
             elif reset_ids is not None:
-                fired = self._apply_reset(name, cfg, reset_ids, global_env_step_count or 0)
+                is_due = self._apply_reset(name, cfg, reset_ids, global_env_step_count or 0)
             else:
                 cfg.func(self._env, env_ids, **cfg.params)
-                fired = True
-            if fired:
-                levels.append(declared_recompute(cfg.func, cfg.params))
-        level = join_levels(levels)
+                is_due = True
+            if is_due:
+                fired.append(cfg)
+        level = joint_level(fired)
         if level != RecomputeLevel.none:
             self._env.sim.recompute_constants(level, reset_ids)
 
@@ -226,7 +188,7 @@ class EventManager(TermFunctionSwitches, TermListManager):
         if not isinstance(timer, torch.Tensor):
             timer -= dt
             due = timer < _TIMER_TOLERANCE
-            self._timers[name] = self._draw_global(cfg) if due else timer
+            self._timers[name] = self._draw(cfg, 1, "cpu").item() if due else timer
             if due:
                 cfg.func(self._env, None, **cfg.params)
             return due
@@ -252,61 +214,24 @@ class EventManager(TermFunctionSwitches, TermListManager):
 
     def _prepare_terms(self) -> None:
         for name, cfg in self.cfg.items():
-            if isinstance(cfg, EventTermCfg) and cfg.mode not in get_args(EventMode):
-                raise ValueError(
-                    f"{self._label(name)}: mode is {cfg.mode!r}, but must be one of "
-                    f"{get_args(EventMode)}."
-                )
+            if isinstance(cfg, EventTermCfg):
+                check_one_of(f"{self._label(name)} mode", cfg.mode, get_args(EventMode))
         super()._prepare_terms()
-
-    def _resolve_params(self, name: str, cfg: ManagerTermBaseCfg) -> None:
-        """Resolve selections, and tell of those that are explicitly empty.
-
-        An empty selection is allowed and changes nothing. Where it was forgotten rather than
-        meant, nobody would notice otherwise.
-        """
-        super()._resolve_params(name, cfg)
-        for key, value in cfg.params.items():
-            if not isinstance(value, SceneEntityCfg):
-                continue
-            for attribute in value.empty_selections():
-                logger.warning(
-                    "%s, parameter %r: %s of entity %r is empty, so the event changes nothing "
-                    "there. Name what it is for, or set the term to None.",
-                    *(self._label(name), key, attribute, value.name),
-                )
-
-    def _prepare_time(self, name: str, cfg: EventTermCfg) -> None:
-        if cfg.mode == "reset":
-            self._last_reset_step[name] = torch.full(
-                (self.num_envs,), _NEVER, dtype=torch.long, device=self.device
-            )
-        bounds = cfg.interval_range_s
-        if bounds is not None and not _is_range(bounds):
-            raise ValueError(
-                f"{self._label(name)}: interval_range_s is {bounds!r}, but must be (shortest, "
-                "longest) in seconds, with 0 <= shortest <= longest."
-            )
-        if cfg.mode != "interval":
-            return
-        if bounds is None:
-            raise ValueError(
-                f"{self._label(name)}: mode 'interval' needs interval_range_s=(shortest, longest) "
-                "in seconds."
-            )
-        self._lookups[name] = Lookup()
-        self._timers[name] = (
-            self._draw_global(cfg) if cfg.is_global_time else self._draw(cfg, self.num_envs)
-        )
+        for name, cfg in zip(self._term_names, self._term_cfgs, strict=True):
+            for key, value in cfg.params.items():
+                # An empty selection is allowed and changes nothing. Where it was forgotten rather
+                # than meant, nobody would notice otherwise.
+                for field in value.empty_selections() if isinstance(value, SceneEntityCfg) else ():
+                    logger.warning(
+                        "%s, parameter %r: %s of entity %r is empty, so the event changes nothing "
+                        "there. Name what it is for, or set the term to None.",
+                        *(self._label(name), key, field, value.name),
+                    )
 
     def _draw(self, cfg: EventTermCfg, count: int, device: str | None = None) -> torch.Tensor:
         low, high = cfg.interval_range_s or (0.0, 0.0)
         drawn = torch.rand(count, dtype=torch.float32, device=device or self.device)
         return drawn * (high - low) + low
-
-    def _draw_global(self, cfg: EventTermCfg) -> float:
-        # On the host, which would wait for a number drawn on a GPU.
-        return self._draw(cfg, 1, "cpu").item()
 
     def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
         terms = zip(self._term_names, self._term_cfgs, strict=True)
@@ -314,29 +239,54 @@ class EventManager(TermFunctionSwitches, TermListManager):
         return ["mode", "name", "interval (s)"], rows
 
 
-def _is_range(bounds: Any) -> bool:
-    is_pair = isinstance(bounds, tuple | list) and len(bounds) == 2
-    return is_pair and all(isinstance(b, Real) for b in bounds) and 0 <= bounds[0] <= bounds[1]
+# Model fields that events declare.
+
+_DERIVED = {
+    RecomputeLevel.set_const_fixed: ("body_subtreemass",),
+    RecomputeLevel.set_const_0: (
+        "dof_invweight0",
+        "body_invweight0",
+        "tendon_length0",
+        "tendon_invweight0",
+        "actuator_acc0",
+    ),
+}
 
 
-def _check_arguments(
-    mode: str,
-    env_ids: torch.Tensor | slice | None,
-    dt: float | None,
-    global_env_step_count: int | None,
-) -> None:
-    """Raise `ValueError` for arguments of `EventManager.apply` that do not fit the mode."""
-    if mode not in get_args(EventMode):
-        raise ValueError(f"Event mode {mode!r} does not exist; modes: {get_args(EventMode)}.")
-    if mode in ("interval", "step") and dt is None:
-        raise ValueError(f"Events of mode {mode!r} need dt, the seconds since the last call.")
-    if mode == "interval" and env_ids is not None:
-        raise ValueError(
-            "Events of mode 'interval' take no env_ids: each environment has its timer."
-        )
-    if mode == "reset" and env_ids is None:
-        raise ValueError("Events of mode 'reset' need env_ids, the environments that reset.")
-    if mode == "reset" and global_env_step_count is None:
-        raise ValueError(
-            "Events of mode 'reset' need global_env_step_count, the environment steps so far."
-        )
+def requires_model_fields(
+    *fields: str, recompute: RecomputeLevel = RecomputeLevel.none
+) -> Callable[[F], F]:
+    """Declare that a function or class, used as an event, changes these fields of the model.
+
+    The fields, and those that derive from them at the level `recompute`, then get a value for each
+    environment, and the latter are recomputed after the event has fired.
+    """
+
+    def declare(function: F) -> F:
+        declared = dict.fromkeys((*fields, *derived_fields(recompute)))
+        setattr(function, "model_fields", tuple(declared))  # noqa: B010
+        setattr(function, "recompute", RecomputeLevel(recompute))  # noqa: B010
+        return function
+
+    return declare
+
+
+def derived_fields(level: RecomputeLevel) -> tuple[str, ...]:
+    """Return the model fields that recomputing at this level writes."""
+    return tuple(f for part, fields in _DERIVED.items() if level & part for f in fields)
+
+
+def joint_level(cfgs: Iterable[EventTermCfg]) -> RecomputeLevel:
+    """Return the level that recomputes what any of these events changes."""
+    levels = (declared(cfg, "recompute", RecomputeLevel.none) for cfg in cfgs)
+    return RecomputeLevel(functools.reduce(operator.or_, levels, 0))
+
+
+def declared(cfg: EventTermCfg, name: str, default: Any) -> Any:
+    """Return what an event's function declares: its `model_fields` or the level `recompute`.
+
+    A function that learns from its parameters which field it changes declares a callable instead,
+    which gets the parameters: `function.model_fields(params)`.
+    """
+    value = getattr(cfg.func, name, default)
+    return value(cfg.params) if callable(value) else value

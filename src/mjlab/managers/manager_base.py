@@ -1,4 +1,4 @@
-"""What all managers share: a named, ordered list of terms, made from their configs.
+"""Base classes of managers: an ordered dict of terms built from their configs.
 
 A manager resolves each term once, when it is built: selections of scene elements in its parameters
 are looked up, a class is replaced by an instance of it, and what does not fit is refused by name.
@@ -15,12 +15,14 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Generic, NoReturn, Protocol, TypeVar
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import torch
 
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.term_checks import check_real, check_term
+from mjlab.utils.errors import UnknownNameError, UnsupportedError, WrongTypeError, check_exists
 from mjlab.utils.indexing import EnvIds, as_index
 from mjlab.utils.state import SKIP, plain_scalar, stateful
 
@@ -30,12 +32,345 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.viewer.debug_visualizer import DebugVisualizer
 
+logger = logging.getLogger(__name__)
+T = TypeVar("T")
+TermT = TypeVar("TermT")
 
-# MERGED mjlab.managers.manager_base: Saying which term an error comes from.
+
+@dataclass
+class ManagerTermBaseCfg:
+    """A term: what to call, and the parameters to call it with."""
+
+    func: Any
+    """A function, or a class that is built with `(cfg, env)` and whose instance is then called.
+    An instance with a `reset(env_ids)` method is reset with its environments."""
+
+    params: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the call. Values that are `SceneEntityCfg` are resolved first."""
+
+
+@stateful
+class ManagerTermBase:
+    """Base of terms that are classes, for those that want its properties.
+
+    Attributes that are tensors or numbers are run-time state: they are saved with a checkpoint and
+    restored, except for those named in a class attribute `_transient`.
+    """
+
+    def __init__(self, env: ManagerBasedRlEnv) -> None:
+        self._env = env
+
+    @property
+    def num_envs(self) -> int:
+        """Number of environments."""
+        return self._env.num_envs
+
+    @property
+    def device(self) -> str:
+        """Device of the tensors that the term gets and returns."""
+        return self._env.device
+
+    @property
+    def name(self) -> str:
+        """Name of the term's class."""
+        return type(self).__name__
+
+    def reset(self, env_ids: torch.Tensor | slice | None) -> Any:
+        """Start a new episode in the given environments (None: all)."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Compute the term's value; terms that managers call override this."""
+        raise UnsupportedError(f"{self.name} must define __call__ to be used as a term.")
+
+
+@stateful
+class ManagerBase(ABC):
+    """Base of all managers; a subclass builds its terms in `_prepare_terms`."""
+
+    _transient = {"cfg", "_term_names", "_value_shape", "_built_values"}
+
+    def __init__(self, env: ManagerBasedRlEnv) -> None:
+        self._env = env
+        self._value_shape = torch.Size((env.num_envs,))
+        # Instances of class-based terms by label; kept here so that their state is saved.
+        self._class_terms: dict[str, Any] = {}
+        self._prepare_terms()
+        self._built_values = {label: plain_values(cfg) for label, cfg in self._live_cfgs().items()}
+
+    def __str__(self) -> str:
+        """Return a table of the active terms."""
+        header, rows = self._table()
+        cells = [["#", *header]]
+        cells += [[str(i), *(str(cell) for cell in row)] for i, row in enumerate(rows)]
+        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+        rule = "+" + "+".join("-" * (width + 2) for width in widths) + "+"
+        head, *body = (
+            "|" + "|".join(f" {cell:<{w}} " for cell, w in zip(row, widths, strict=True)) + "|"
+            for row in cells
+        )
+        title = f"<{type(self).__name__}> with {len(rows)} active terms"
+        return "\n".join([title, rule, head, rule, *body, rule])
+
+    @property
+    def num_envs(self) -> int:
+        """Number of environments."""
+        return self._env.num_envs
+
+    @property
+    def device(self) -> str:
+        """Device of all tensors."""
+        return self._env.device
+
+    @property
+    @abstractmethod
+    def active_terms(self) -> list[str] | dict[Any, list[str]]:
+        """Names of the terms that are switched on, in order."""
+
+    def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
+        """Start a new episode in the given environments (None: all) and return what to log."""
+        self._reset_class_terms(env_ids)
+        return {}
+
+    def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
+        """Return, for one environment, the name and the current values of each term."""
+        return []
+
+    def config_edits(self) -> dict[str, Any]:
+        """Return what was changed in the configs of terms since they were built.
+
+        It is run-time state (the stage of a curriculum, say) for `apply_config_edits` to restore:
+        nested dicts of numbers, strings, tensors and sequences of those. Configs as a whole are
+        not, because whoever resumes may have set other values on purpose.
+        """
+        edits = {
+            label: changes(self._built_values[label], plain_values(cfg))
+            for label, cfg in self._live_cfgs().items()
+        }
+        return {label: edit for label, edit in edits.items() if edit}
+
+    def apply_config_edits(self, edits: Mapping[str, Any]) -> None:
+        """Bring configs to where they were when `config_edits` returned this.
+
+        What it does not name is set to the value as built, because the configs may have been edited
+        since, by a first reset say. Changes of terms that are gone are skipped.
+        """
+        for label, cfg in self._live_cfgs().items():
+            undone = changes(plain_values(cfg), self._built_values[label])
+            write_changes(cfg, copy.deepcopy(undone))
+            write_changes(cfg, edits.get(label, {}))
+
+    # For subclasses.
+
+    @abstractmethod
+    def _prepare_terms(self) -> None:
+        """Build the terms from the config."""
+
+    def _live_cfgs(self) -> dict[str, Any]:
+        """Return the config that each term reads, by label."""
+        return {}
+
+    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
+        """Return the header and the rows of the printed table."""
+        return ["name"], [[name] for name in self.active_terms]
+
+    def _label(self, name: str) -> str:
+        return f"{type(self).__name__} term {name!r}"
+
+    def _enabled(
+        self, cfg: Mapping[str, T | None], kind: type[T], quiet: bool = False
+    ) -> Iterator[tuple[str, T]]:
+        """Yield the terms that are not None, having checked that they are of the right kind."""
+        for name, term_cfg in cfg.items():
+            if term_cfg is None:
+                if not quiet:
+                    logger.info("%s: term %r is None, so it is off.", type(self).__name__, name)
+                continue
+            if not isinstance(term_cfg, kind):
+                raise WrongTypeError(
+                    f"{self._label(name)} must be a {kind.__name__} (or None to switch it off), "
+                    f"got {type(term_cfg).__name__}: {term_cfg!r}."
+                )
+            yield name, term_cfg
+
+    def _resolve_term(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
+        """Resolve the selections in `cfg.params`, and replace a class by an instance of it.
+
+        Args:
+            name: Name of the term, for messages.
+            cfg: Config of the term, which this manager owns: it is changed.
+            leading: Names of the positional arguments of the call, before the parameters.
+        """
+        self._resolve_params(name, cfg)
+        if not callable(cfg.func):
+            raise WrongTypeError(
+                f"{self._label(name)}: func must be a function or a class, got {cfg.func!r}."
+            )
+        self._make_callable(name, cfg, leading)
+
+    def _resolve_params(self, name: str, cfg: ManagerTermBaseCfg) -> None:
+        """Look up, in the scene, the top-level parameters that select elements of an entity."""
+        for key, value in cfg.params.items():
+            if isinstance(value, SceneEntityCfg):
+                with label_errors(f"{self._label(name)}, parameter {key!r}"):
+                    value.resolve(self._env.scene)
+
+    def _make_callable(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
+        """Replace a class by an instance of it, and check that the term can be called."""
+        if inspect.isclass(cfg.func):
+            with label_errors(self._label(name)):
+                cfg.func = cfg.func(cfg=cfg, env=self._env)
+            if not callable(cfg.func):
+                raise WrongTypeError(
+                    f"{self._label(name)}: {type(cfg.func).__name__} has no __call__."
+                )
+        try:
+            signature = inspect.signature(cfg.func)
+        except (ValueError, TypeError):
+            signature = None
+        if signature is not None:
+            try:
+                signature.bind(*leading, **cfg.params)
+            except TypeError as error:
+                function = getattr(cfg.func, "__qualname__", type(cfg.func).__name__)
+                raise WrongTypeError(
+                    f"{self._label(name)}: {function}{signature} cannot be called with "
+                    f"({', '.join(leading)}) and the parameters {list(cfg.params)}: {error}."
+                ) from error
+        with label_errors(self._label(name)):
+            check_term(cfg.func, self._env, cfg.params)
+        if not inspect.isroutine(cfg.func):
+            # A term written as a plain class has run-time state like any other. Types that do not
+            # come from a class statement (functools.partial, say) cannot be marked and hold none.
+            with contextlib.suppress(TypeError):
+                stateful(type(cfg.func))
+            self._class_terms[name] = cfg.func
+
+    def _reset_class_terms(self, env_ids: EnvIds) -> None:
+        for term in self._class_terms.values():
+            reset = getattr(term, "reset", None)
+            if callable(reset):
+                reset(env_ids=as_index(env_ids))
+
+    def _check_value(self, name: str, value: Any) -> None:
+        """Raise unless `value` is a tensor with one entry for each environment."""
+        if not isinstance(value, torch.Tensor):
+            raise WrongTypeError(
+                f"{self._label(name)} must return a tensor of shape {tuple(self._value_shape)}, "
+                f"got {type(value).__name__}: {value!r}."
+            )
+        if value.shape != self._value_shape:
+            raise ValueError(
+                f"{self._label(name)} returned shape {tuple(value.shape)}, expected "
+                f"{tuple(self._value_shape)}: one value for each environment. Reduce the other "
+                "dimensions (sum, mean, squeeze) in the term."
+            )
+        check_real(value, self._label, name)
+
+    def _check_known(
+        self, name: str, known: Sequence[str], error: type[Exception] = ValueError
+    ) -> None:
+        """Raise `error` with the valid names unless `name` is one of them."""
+        check_exists(f"{type(self).__name__} term", name, known, error)
+
+
+class TermListManager(ManagerBase):
+    """A manager of one list of terms, whose config it copies."""
+
+    _transient = {"_term_cfgs"}
+    _cfg_type: type[ManagerTermBaseCfg] = ManagerTermBaseCfg
+    _leading: Sequence[str] = ("env",)
+    # Fields of a term's config that the printed table shows.
+    _shown: Sequence[str] = ()
+
+    def __init__(self, cfg: Mapping[str, Any], env: ManagerBasedRlEnv) -> None:
+        # Terms are copied one by one, so that one config used twice becomes two terms.
+        self.cfg = {name: copy.deepcopy(term_cfg) for name, term_cfg in cfg.items()}
+        super().__init__(env)
+
+    @property
+    def active_terms(self) -> list[str]:
+        """Names of the terms that are switched on, in order."""
+        return self._term_names
+
+    def get_term_cfg(self, term_name: str) -> Any:
+        """Return the live config of a term: what is changed in it takes effect at the next call.
+
+        Raises `ValueError`, with the valid names, if there is no such term.
+        """
+        self._check_known(term_name, self._term_names)
+        return self._term_cfgs[self._term_names.index(term_name)]
+
+    def _live_cfgs(self) -> dict[str, Any]:
+        return dict(zip(self._term_names, self._term_cfgs, strict=True))
+
+    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
+        header = ["name", *(field.replace("_", " ") for field in self._shown)]
+        rows = [
+            (name, *(getattr(cfg, field) for field in self._shown))
+            for name, cfg in self._live_cfgs().items()
+        ]
+        return header, rows
+
+    def _prepare_terms(self) -> None:
+        self._term_names: list[str] = []
+        self._term_cfgs: list[Any] = []
+        for name, term_cfg in self._enabled(self.cfg, self._cfg_type):
+            self._resolve_term(name, term_cfg, self._leading)
+            self._term_names.append(name)
+            self._term_cfgs.append(term_cfg)
+
+
+class BuiltTermsManager(ManagerBase, Generic[TermT]):
+    """A manager of terms that their configs make in `build`. It keeps its config by reference."""
+
+    _cfg_type: type[Any]
+    _term_type: type[TermT]
+
+    def __init__(self, cfg: Mapping[str, Any], env: ManagerBasedRlEnv) -> None:
+        self.cfg = cfg
+        self._terms: dict[str, TermT] = {}
+        super().__init__(env)
+
+    @property
+    def active_terms(self) -> list[str]:
+        """Names of the terms, in order."""
+        return list(self._terms)
+
+    def get_term(self, name: str) -> TermT:
+        """Return a term; raises `KeyError`, with the valid names, if there is none."""
+        self._check_known(name, self.active_terms, UnknownNameError)
+        return self._terms[name]
+
+    def _prepare_terms(self) -> None:
+        for name, term_cfg in self._enabled(self.cfg, self._cfg_type):
+            with label_errors(self._label(name)):
+                term = term_cfg.build(self._env)
+            if not isinstance(term, self._term_type):
+                raise WrongTypeError(
+                    f"{self._label(name)}: {type(term_cfg).__name__}.build must return an "
+                    f"instance of {self._term_type.__name__}, got {type(term).__name__}."
+                )
+            self._terms[name] = term
+
+    def _live_cfgs(self) -> dict[str, Any]:
+        terms: dict[str, Any] = dict(self._terms)
+        return {name: term.cfg for name, term in terms.items()}
+
+
+class NullManager:
+    """Mixin of managers without terms, which need no environment."""
+
+    def __init__(self) -> None:
+        super().__init__({}, SimpleNamespace(num_envs=0, device="cpu"))  # ty: ignore
+        self.cfg = None
+
+    def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
+        """Return no terms."""
+        return []
 
 
 @contextlib.contextmanager
-def errors_named(label: str) -> Generator[None]:
+def label_errors(label: str) -> Generator[None]:
     """Put `label` in front of the message of a `KeyError`, `TypeError` or `ValueError` of the block.
 
     What a term raises while it is built knows its cause, but not which of many terms it is. The
@@ -45,24 +380,18 @@ def errors_named(label: str) -> Generator[None]:
     try:
         yield
     except (KeyError, TypeError, ValueError) as error:
-        raise _relabelled(error, label) from error
+        # A KeyError shows its message as a quoted string, so that it is read from its arguments.
+        details = error.args[0] if len(error.args) == 1 else error
+        message = f"{label}: {details}"
+        try:
+            labelled = type(error)(message)
+        except TypeError:
+            kind = next(k for k in (KeyError, TypeError, ValueError) if isinstance(error, k))
+            labelled = kind(message)
+        raise labelled from error
 
 
-def _relabelled(error: KeyError | TypeError | ValueError, label: str) -> Exception:
-    # A KeyError shows its message as a quoted string, so that it is read from its arguments.
-    details = error.args[0] if len(error.args) == 1 else error
-    message = f"{label}: {details}"
-    try:
-        return type(error)(message)
-    except TypeError:
-        kind = next(k for k in (KeyError, TypeError, ValueError) if isinstance(error, k))
-        return kind(message)
-
-
-# MERGED mjlab.managers.manager_base: What was changed in the configs of terms at run time, by curricula say.
-#
-# Changes are run-time state: a run that resumes has to continue with them. Configs as a whole are
-# not, because whoever resumes may have set other values on purpose.
+# Changes of configs.
 
 
 def plain_values(cfg: Any) -> dict[str, Any]:
@@ -74,12 +403,9 @@ def plain_values(cfg: Any) -> dict[str, Any]:
     for key, value in _items(cfg):
         if callable(value):
             continue
-        if _is_branch(value):
-            values[key] = plain_values(value)
-        else:
-            plain = _plain(value)
-            if plain is not SKIP:
-                values[key] = plain
+        plain = plain_values(value) if _is_branch(value) else _plain(value)
+        if plain is not SKIP:
+            values[key] = plain
     return values
 
 
@@ -142,399 +468,7 @@ def _same(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
-# MERGED mjlab.managers.manager_base: Plain text tables: what printing a manager shows.
-
-
-def format_table(title: str, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """Return a text table with a numbered row for each of `rows`.
-
-    Args:
-        title: One line above the table.
-        header: Names of the columns; a column of row numbers is put before them.
-        rows: As many cells a row as there are columns; cells are shown by `str`.
-    """
-    cells = [["#", *header]]
-    cells += [[str(i), *(str(cell) for cell in row)] for i, row in enumerate(rows)]
-    widths = [max(len(row[column]) for row in cells) for column in range(len(cells[0]))]
-    rule = "+" + "+".join("-" * (width + 2) for width in widths) + "+"
-    lines = [
-        "|" + "|".join(f" {cell:<{width}} " for cell, width in zip(row, widths, strict=True)) + "|"
-        for row in cells
-    ]
-    return "\n".join([title, rule, lines[0], rule, *lines[1:], rule])
-
-
-logger = logging.getLogger(__name__)
-T = TypeVar("T")
-
-
-@dataclass
-class ManagerTermBaseCfg:
-    """A term: what to call, and the parameters to call it with."""
-
-    func: Any
-    """A function, or a class that is built with `(cfg, env)` and whose instance is then called.
-    An instance with a `reset(env_ids)` method is reset with its environments."""
-
-    params: dict[str, Any] = field(default_factory=dict)
-    """Keyword arguments of the call. Values that are `SceneEntityCfg` are resolved first."""
-
-
-@stateful
-class ManagerTermBase:
-    """Base of terms that are classes, for those that want its properties.
-
-    Attributes that are tensors or numbers are run-time state: they are saved with a checkpoint and
-    restored, except for those named in a class attribute `_transient`.
-    """
-
-    def __init__(self, env: ManagerBasedRlEnv) -> None:
-        self._env = env
-
-    @property
-    def num_envs(self) -> int:
-        """Number of environments."""
-        return self._env.num_envs
-
-    @property
-    def device(self) -> str:
-        """Device of the tensors that the term gets and returns."""
-        return self._env.device
-
-    @property
-    def name(self) -> str:
-        """Name of the term's class."""
-        return type(self).__name__
-
-    def reset(self, env_ids: torch.Tensor | slice | None) -> Any:
-        """Start a new episode in the given environments (None: all)."""
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """Compute the term's value; terms that managers call override this."""
-        raise NotImplementedError(f"{self.name} must define __call__ to be used as a term.")
-
-
-@stateful
-class ManagerBase(ABC):
-    """Base of all managers; a subclass builds its terms in `_prepare_terms`."""
-
-    _transient = {"cfg", "_term_names", "_value_shape", "_built_values"}
-
-    def __init__(self, env: ManagerBasedRlEnv) -> None:
-        self._env = env
-        self._value_shape = torch.Size((env.num_envs,))
-        # Instances of class-based terms by label; kept here so that their state is saved.
-        self._class_terms: dict[str, Any] = {}
-        self._prepare_terms()
-        self._built_values = {label: plain_values(cfg) for label, cfg in self._live_cfgs().items()}
-
-    def __str__(self) -> str:
-        """Return a table of the active terms."""
-        header, rows = self._table()
-        title = f"<{type(self).__name__}> with {len(rows)} active terms"
-        return format_table(title, header, rows)
-
-    @property
-    def num_envs(self) -> int:
-        """Number of environments."""
-        return self._env.num_envs
-
-    @property
-    def device(self) -> str:
-        """Device of all tensors."""
-        return self._env.device
-
-    @property
-    @abstractmethod
-    def active_terms(self) -> list[str] | dict[Any, list[str]]:
-        """Names of the terms that are switched on, in order."""
-
-    def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
-        """Start a new episode in the given environments (None: all) and return what to log."""
-        self._reset_class_terms(env_ids)
-        return {}
-
-    def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
-        """Return, for one environment, the name and the current values of each term."""
-        return []
-
-    def config_edits(self) -> dict[str, Any]:
-        """Return what was changed in the configs of terms since they were built.
-
-        It is run-time state (the stage of a curriculum, say) for `apply_config_edits` to restore:
-        nested dicts of numbers, strings, tensors and sequences of those.
-        """
-        edits = {
-            label: changes(self._built_values[label], plain_values(cfg))
-            for label, cfg in self._live_cfgs().items()
-        }
-        return {label: edit for label, edit in edits.items() if edit}
-
-    def apply_config_edits(self, edits: Mapping[str, Any]) -> None:
-        """Bring configs to where they were when `config_edits` returned this.
-
-        What it does not name is set to the value as built, because the configs may have been edited
-        since, by a first reset say. Changes of terms that are gone are skipped.
-        """
-        for label, cfg in self._live_cfgs().items():
-            undone = changes(plain_values(cfg), self._built_values[label])
-            write_changes(cfg, copy.deepcopy(undone))
-            write_changes(cfg, edits.get(label, {}))
-
-    def _live_cfgs(self) -> dict[str, Any]:
-        """Return the config that each term reads, by label."""
-        return {}
-
-    @abstractmethod
-    def _prepare_terms(self) -> None:
-        """Build the terms from the config."""
-
-    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
-        """Return the header and the rows of the printed table."""
-        return ["name"], [[name] for name in self.active_terms]
-
-    # Resolving terms.
-
-    def _enabled(
-        self, cfg: Mapping[str, T | None], kind: type[T], quiet: bool = False
-    ) -> Iterator[tuple[str, T]]:
-        """Yield the terms that are not None, having checked that they are of the right kind."""
-        for name, term_cfg in cfg.items():
-            if term_cfg is None:
-                if not quiet:
-                    logger.info("%s: term %r is None, so it is off.", type(self).__name__, name)
-                continue
-            if not isinstance(term_cfg, kind):
-                raise TypeError(
-                    f"{self._label(name)} must be a {kind.__name__} (or None to switch it off), "
-                    f"got {type(term_cfg).__name__}: {term_cfg!r}."
-                )
-            yield name, term_cfg
-
-    def _resolve_term(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
-        """Resolve the selections in `cfg.params`, and replace a class by an instance of it.
-
-        Args:
-            name: Name of the term, for messages.
-            cfg: Config of the term, which this manager owns: it is changed.
-            leading: Names of the positional arguments of the call, before the parameters.
-        """
-        self._resolve_params(name, cfg)
-        if not callable(cfg.func):
-            raise TypeError(
-                f"{self._label(name)}: func must be a function or a class, got {cfg.func!r}."
-            )
-        self._make_callable(name, cfg, leading)
-
-    def _make_callable(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
-        """Replace a class by an instance of it, and check that the term can be called."""
-        if inspect.isclass(cfg.func):
-            with errors_named(self._label(name)):
-                cfg.func = cfg.func(cfg=cfg, env=self._env)
-            if not callable(cfg.func):
-                raise TypeError(f"{self._label(name)}: {type(cfg.func).__name__} has no __call__.")
-        self._check_parameters(name, cfg, leading)
-        with errors_named(self._label(name)):
-            check_term(cfg.func, self._env, cfg.params)
-        self._keep_class_term(name, cfg.func)
-
-    def _resolve_params(self, name: str, cfg: ManagerTermBaseCfg) -> None:
-        """Look up, in the scene, the top-level parameters that select elements of an entity."""
-        for key, value in cfg.params.items():
-            if not isinstance(value, SceneEntityCfg):
-                continue
-            try:
-                value.resolve(self._env.scene)
-            except (ValueError, KeyError) as error:
-                message = f"{self._label(name)}, parameter {key!r}: {error.args[0]}"
-                raise type(error)(message) from error
-
-    def _check_parameters(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
-        """Raise TypeError now if calling the term would, because its parameters do not fit."""
-        try:
-            signature = inspect.signature(cfg.func)
-        except (ValueError, TypeError):
-            return
-        try:
-            signature.bind(*leading, **cfg.params)
-        except TypeError as error:
-            raise TypeError(
-                f"{self._label(name)}: {_function_name(cfg.func)}{signature} cannot be called with "
-                f"({', '.join(leading)}) and the parameters {list(cfg.params)}: {error}."
-            ) from error
-
-    def _keep_class_term(self, name: str, func: Any) -> None:
-        if inspect.isroutine(func):
-            return
-        # A term written as a plain class has run-time state like any other. Types that do not
-        # come from a class statement (functools.partial, say) cannot be marked and hold none.
-        with contextlib.suppress(TypeError):
-            stateful(type(func))
-        self._class_terms[name] = func
-
-    def _reset_class_terms(self, env_ids: EnvIds) -> None:
-        for term in self._class_terms.values():
-            reset = getattr(term, "reset", None)
-            if callable(reset):
-                reset(env_ids=as_index(env_ids))
-
-    # Messages.
-
-    def _label(self, name: str) -> str:
-        return f"{type(self).__name__} term {name!r}"
-
-    def _check_value(self, name: str, value: Any) -> None:
-        """Raise unless `value` is a tensor with one entry for each environment."""
-        if not isinstance(value, torch.Tensor):
-            raise TypeError(
-                f"{self._label(name)} must return a tensor of shape {tuple(self._value_shape)}, "
-                f"got {type(value).__name__}: {value!r}."
-            )
-        if value.shape != self._value_shape:
-            raise ValueError(
-                f"{self._label(name)} returned shape {tuple(value.shape)}, expected "
-                f"{tuple(self._value_shape)}: one value for each environment. Reduce the other "
-                "dimensions (sum, mean, squeeze) in the term."
-            )
-        check_real(self._label(name), value)
-
-    def _unknown(self, name: str, known: Sequence[str], error: type[Exception]) -> NoReturn:
-        raise error(f"{type(self).__name__} has no term {name!r}. Its terms: {list(known)}.")
-
-
-class TermListManager(ManagerBase):
-    """A manager of one list of terms, whose config it copies."""
-
-    _transient = {"_term_cfgs"}
-    _cfg_type: type[ManagerTermBaseCfg] = ManagerTermBaseCfg
-    _leading: Sequence[str] = ("env",)
-
-    def __init__(self, cfg: Mapping[str, Any], env: ManagerBasedRlEnv) -> None:
-        # Terms are copied one by one, so that one config used twice becomes two terms.
-        self.cfg = {name: copy.deepcopy(term_cfg) for name, term_cfg in cfg.items()}
-        super().__init__(env)
-
-    @property
-    def active_terms(self) -> list[str]:
-        """Names of the terms that are switched on, in order."""
-        return self._term_names
-
-    def get_term_cfg(self, term_name: str) -> Any:
-        """Return the live config of a term: what is changed in it takes effect at the next call.
-
-        Raises `ValueError`, with the valid names, if there is no such term.
-        """
-        if term_name not in self._term_names:
-            self._unknown(term_name, self._term_names, ValueError)
-        return self._term_cfgs[self._term_names.index(term_name)]
-
-    def _live_cfgs(self) -> dict[str, Any]:
-        return dict(zip(self._term_names, self._term_cfgs, strict=True))
-
-    def _prepare_terms(self) -> None:
-        self._term_names: list[str] = []
-        self._term_cfgs: list[Any] = []
-        for name, term_cfg in self._enabled(self.cfg, self._cfg_type):
-            self._resolve_term(name, term_cfg, self._leading)
-            self._term_names.append(name)
-            self._term_cfgs.append(term_cfg)
-
-
-def _function_name(func: Any) -> str:
-    return getattr(func, "__qualname__", type(func).__name__)
-
-
-# MERGED mjlab.managers.manager_base: What managers share whose terms are made by their configs' `build`.
-
-
-class BuildsTerm(Protocol):
-    """A config that says in `build` which term it makes."""
-
-    def build(self, env: ManagerBasedRlEnv) -> Any:
-        """Return the term."""
-
-
-class HasCfg(Protocol):
-    """A term that keeps its config."""
-
-    cfg: Any
-
-
-TermT = TypeVar("TermT", bound=HasCfg)
-
-
-class BuiltTermsManager(ManagerBase, Generic[TermT]):
-    """A manager that holds terms by name and keeps its config by reference."""
-
-    _cfg_type: type[BuildsTerm]
-    _term_type: type[TermT]
-
-    def __init__(self, cfg: Mapping[str, Any], env: ManagerBasedRlEnv) -> None:
-        self.cfg = cfg
-        self._terms: dict[str, TermT] = {}
-        super().__init__(env)
-
-    @property
-    def active_terms(self) -> list[str]:
-        """Names of the terms, in order."""
-        return list(self._terms)
-
-    def get_term(self, name: str) -> TermT:
-        """Return a term; raises `KeyError`, with the valid names, if there is none."""
-        if name not in self._terms:
-            self._unknown(name, self.active_terms, KeyError)
-        return self._terms[name]
-
-    def _prepare_terms(self) -> None:
-        for name, term_cfg in self._enabled(self.cfg, self._cfg_type):
-            with errors_named(self._label(name)):
-                term = term_cfg.build(self._env)
-            if not isinstance(term, self._term_type):
-                raise TypeError(
-                    f"{self._label(name)}: {type(term_cfg).__name__}.build must return an "
-                    f"instance of {self._term_type.__name__}, got {type(term).__name__}."
-                )
-            self._terms[name] = term
-
-    def _live_cfgs(self) -> dict[str, Any]:
-        return {name: term.cfg for name, term in self._terms.items()}
-
-
-# MERGED mjlab.managers.manager_base: Stand-in for a term that is off and could not be built.
-
-
-class UnreadyTerm:
-    """Is called instead of a term that is off and does not fit, and tries to build it again then.
-
-    A term that is off may be left unfilled: what does not fit matters only when it is switched on.
-
-    Args:
-        build: Builds the term and returns what to call from then on, or raises what was wrong.
-    """
-
-    def __init__(self, build: Callable[[], Any]) -> None:
-        self._build = build
-
-    def __call__(self, env: Any, **params: Any) -> Any:
-        """Build the term, and return its value."""
-        return self._build()(env, **params)
-
-
-# MERGED mjlab.managers.manager_base: Means over environments that one diverged environment does not spoil.
-
-
-def finite_mean(values: torch.Tensor) -> torch.Tensor:
-    """Return the mean over the last axis, leaving out NaN and infinite values; 0 if none is left.
-
-    Args:
-        values: Float tensor (..., E) with one value for each of E environments.
-    """
-    # `isfinite` takes twice the operations.
-    finite = values.abs() < torch.inf
-    return torch.where(finite, values, 0.0).sum(dim=-1) / finite.sum(dim=-1).clamp(min=1)
-
-
-# MERGED mjlab.managers.manager_base: Debug drawings of terms, with a switch for each that viewers offer.
+# Debug drawings of terms, with a switch for each that viewers offer.
 
 
 class DebugVisSwitches:
@@ -557,9 +491,7 @@ class DebugVisSwitches:
 
         Raises `ValueError`, with the valid names, if no such term can draw.
         """
-        names = [known for known, _ in self.get_visualizable_terms()]
-        if name not in names:
-            raise ValueError(f"No term {name!r} can draw. Terms that can: {names}.")
+        check_exists("drawing term", name, [known for known, _ in self.get_visualizable_terms()])
         self._hidden = self._hidden - {name} if enabled else self._hidden | {name}
 
     def create_debug_vis_gui(
@@ -567,18 +499,14 @@ class DebugVisSwitches:
     ) -> None:
         """Add a check box for each term that can draw; `on_change` is called after a change."""
         for name, _ in self.get_visualizable_terms():
-            self._add_checkbox(server, name, on_change)
+            box = server.gui.add_checkbox(name, initial_value=name not in self._hidden)
 
-    def _add_checkbox(
-        self, server: viser.ViserServer, name: str, on_change: Callable[[], None] | None
-    ) -> None:
-        box = server.gui.add_checkbox(name, initial_value=name not in self._hidden)
+            def switch(_event: Any, name: str = name, box: Any = box) -> None:
+                self.set_debug_vis(name, box.value)
+                if on_change is not None:
+                    on_change()
 
-        @box.on_update
-        def _(_event: Any) -> None:
-            self.set_debug_vis(name, box.value)
-            if on_change is not None:
-                on_change()
+            box.on_update(switch)
 
 
 class TermFunctionSwitches(DebugVisSwitches):

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 
 from mjlab.compat import offers_older_attributes
-from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager, finite_mean
-from mjlab.managers.null_managers import NullMetricsManager as NullMetricsManager
+from mjlab.managers.manager_base import ManagerTermBaseCfg, NullManager, TermListManager
+from mjlab.managers.nonfinite import finite_mean
+from mjlab.utils.errors import check_one_of
 from mjlab.utils.indexing import as_index, is_empty
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ class MetricsManager(TermListManager):
     """
 
     _cfg_type = MetricsTermCfg
+    _shown = ("reduce", "per_substep")
     _transient = {"_rows", "_substep_rows", "_terms_by_reduce", "excluded"}
 
     def __init__(self, cfg: Mapping[str, MetricsTermCfg | None], env: ManagerBasedRlEnv) -> None:
@@ -56,7 +58,10 @@ class MetricsManager(TermListManager):
         )
         self._substep_rows = dict(zip(substep_terms, self._substep_sums, strict=True))
         self._substeps = 0
-        self._terms_by_reduce = self._group_by_reduce()
+        self._terms_by_reduce: dict[str, list[int]] = {}
+        for k, (name, term) in enumerate(zip(self._term_names, self._term_cfgs, strict=True)):
+            check_one_of(f"{self._label(name)} reduce", term.reduce, REDUCE_OPTIONS)
+            self._terms_by_reduce.setdefault(term.reduce, []).append(k)
 
     @property
     def needs_substep(self) -> bool:
@@ -76,6 +81,8 @@ class MetricsManager(TermListManager):
 
         Raises `ValueError` if a term returns another shape than (num_envs,).
         """
+        if not self._rows:
+            return
         for k, row in enumerate(self._rows):
             if k in self._substep_rows:
                 torch.div(self._substep_rows[k], max(self._substeps, 1), out=row)
@@ -104,7 +111,12 @@ class MetricsManager(TermListManager):
         index = as_index(env_ids)
         values: dict[int, torch.Tensor] = {}
         for reduce, terms in self._terms_by_reduce.items():
-            means = self._episode_means(reduce, index)
+            if reduce == "mean":
+                reduced = self._sum[:, index] / self._steps[index].clamp(min=1.0)
+            else:
+                # Without a step the maximum is minus infinity, which is left out.
+                reduced = {"sum": self._sum, "last": self._last, "max": self._max}[reduce][:, index]
+            means = finite_mean(reduced)
             values |= {k: means[k] for k in terms}
         self._sum[:, index] = 0.0
         self._max[:, index] = -torch.inf
@@ -122,29 +134,6 @@ class MetricsManager(TermListManager):
         self._check_value(self._term_names[k], value)
         return value
 
-    def _episode_means(self, reduce: str, index: torch.Tensor | slice) -> torch.Tensor:
-        """Return the mean over environments of every term (terms,), reduced in this way."""
-        if reduce == "mean":
-            return finite_mean(self._sum[:, index] / self._steps[index].clamp(min=1.0))
-        if reduce == "sum":
-            return finite_mean(self._sum[:, index])
-        if reduce == "last":
-            return finite_mean(self._last[:, index])
-        # Without a step the maximum is minus infinity, which is left out.
-        return finite_mean(self._max[:, index])
 
-    def _group_by_reduce(self) -> dict[str, list[int]]:
-        groups: dict[str, list[int]] = {}
-        for k, (name, cfg) in enumerate(zip(self._term_names, self._term_cfgs, strict=True)):
-            if cfg.reduce not in REDUCE_OPTIONS:
-                raise ValueError(
-                    f"{self._label(name)}: reduce is {cfg.reduce!r}, but must be one of "
-                    f"{REDUCE_OPTIONS}."
-                )
-            groups.setdefault(cfg.reduce, []).append(k)
-        return groups
-
-    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
-        terms = zip(self._term_names, self._term_cfgs, strict=True)
-        rows = [(name, cfg.reduce, cfg.per_substep) for name, cfg in terms]
-        return ["name", "reduce", "per substep"], rows
+class NullMetricsManager(NullManager, MetricsManager):
+    """Metrics manager without terms."""

@@ -1,4 +1,4 @@
-"""Terms that return NaN or infinite values: counted, named once, and told when it does not stop."""
+"""Values of terms that are NaN or infinite: counted, named once, left out of means."""
 
 from __future__ import annotations
 
@@ -84,3 +84,14 @@ class NonFiniteWatch:
         of steps in a row up to now."""
         streaks = zip(self._labels, self._streaks.tolist(), strict=True)
         return {label: steps for label, steps in streaks if steps > 0}
+
+
+def finite_mean(values: torch.Tensor) -> torch.Tensor:
+    """Return the mean over the last axis, leaving out NaN and infinite values; 0 if none is left.
+
+    Args:
+        values: Float tensor (..., E) with one value for each of E environments.
+    """
+    # `isfinite` takes twice the operations.
+    finite = values.abs() < torch.inf
+    return torch.where(finite, values, 0.0).sum(dim=-1) / finite.sum(dim=-1).clamp(min=1)

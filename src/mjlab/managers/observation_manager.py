@@ -5,17 +5,17 @@ from __future__ import annotations
 import copy
 import dataclasses
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Real
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import torch
 
 from mjlab.compat import offers_older_attributes
-from mjlab.managers.manager_base import ManagerBase, ManagerTermBaseCfg, errors_named
-from mjlab.managers.term_checks import check_real
+from mjlab.managers.manager_base import ManagerBase, ManagerTermBaseCfg, label_errors
+from mjlab.managers.term_checks import check_real, is_interval
 from mjlab.utils.buffers import CircularBuffer, DelayBuffer
+from mjlab.utils.errors import WrongTypeError, check_count, check_exists, check_one_of
 from mjlab.utils.indexing import is_empty
 from mjlab.utils.noise import NoiseCfg, NoiseModelCfg
 from mjlab.utils.random import preserved_rng
@@ -24,100 +24,9 @@ from mjlab.utils.state import capture_state, is_stateful, restore_state, statefu
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
-
-# MERGED mjlab.managers.observation_manager: Checks of noise, clip and scale of an observation term, made when it is built.
-
-
-def check_noise(label: str, noise: Any) -> None:
-    """Raise `ValueError` unless `noise` is None or the config of a noise or a noise model."""
-    if noise is None or isinstance(noise, NoiseCfg | NoiseModelCfg):
-        return
-    raise ValueError(
-        f"Observation term {label!r}: noise is {noise!r}, but must be a NoiseCfg "
-        "(UniformNoiseCfg(n_min=-0.1, n_max=0.1), say), a NoiseModelCfg, or None."
-    )
-
-
-def check_clip(label: str, clip: Any) -> None:
-    """Raise `ValueError` unless `clip` is None or two numbers, the second not the smaller."""
-    if clip is None:
-        return
-    is_pair = (
-        isinstance(clip, tuple | list)
-        and len(clip) == 2
-        and all(isinstance(bound, Real) for bound in clip)
-    )
-    # A bound that is NaN fails the comparison as well.
-    if not is_pair or not clip[0] <= clip[1]:
-        raise ValueError(
-            f"Observation term {label!r}: clip is {clip!r}, but must be (lowest, highest), two "
-            "numbers of which the second is not the smaller; None does not clip."
-        )
-
-
-def scale_tensor(label: str, scale: Any, raw_shape: torch.Size, device: str) -> torch.Tensor:
-    """Return `scale` as a tensor that multiplies values of `raw_shape` (num_envs, ...).
-
-    A tensor is returned as it is, anything else as float32 on `device`.
-
-    Raises `ValueError` if it is no number or numbers, or does not fit `raw_shape`.
-    """
-    tensor = scale
-    if not isinstance(scale, torch.Tensor):
-        try:
-            tensor = torch.tensor(scale, dtype=torch.float32, device=device)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(
-                f"Observation term {label!r}: scale is {scale!r}, but must be one number, one for "
-                "each component, or None."
-            ) from error
-    if not _fits(tensor.shape, raw_shape):
-        raise ValueError(
-            f"Observation term {label!r}: scale has shape {tuple(tensor.shape)}, which does not "
-            f"fit the term's value of shape {tuple(raw_shape)}. Give one number, or one for each "
-            f"of the {raw_shape[-1]} components of the last axis."
-        )
-    return tensor
-
-
-def _fits(shape: torch.Size, raw_shape: torch.Size) -> bool:
-    try:
-        # A larger result would mean that the scale stretches the observation.
-        return torch.broadcast_shapes(shape, raw_shape) == raw_shape
-    except RuntimeError:
-        return False
-
-
-# MERGED mjlab.managers.observation_manager: What to do with observations that are NaN or infinite.
-
 logger = logging.getLogger(__name__)
 NanPolicy = Literal["disabled", "warn", "sanitize", "error"]
-NAN_POLICIES = ("disabled", "warn", "sanitize", "error")
-
-
-def apply_nan_policy(value: torch.Tensor, policy: NanPolicy, label: str) -> torch.Tensor:
-    """Return `value` (num_envs, ...) after the policy.
-
-    "disabled" looks at nothing, "sanitize" replaces NaN and infinite numbers by 0, "warn" logs the
-    environments first, and "error" raises `ValueError` with `label` and up to 10 environments.
-    """
-    if policy == "disabled":
-        return value
-    if policy != "sanitize":
-        bad = ~torch.isfinite(value).flatten(1).all(dim=1)
-        if not bad.any():
-            return value
-        ids = bad.nonzero().flatten()
-        shown = ids[: 10 if policy == "error" else 5].tolist()
-        message = f"Observation {label!r} is NaN or infinite in {len(ids)} environments: {shown}"
-        message += " and others." if len(ids) > len(shown) else "."
-        if policy == "error":
-            raise ValueError(message)
-        logger.warning("%s Replaced by 0.", message)
-    return torch.nan_to_num(value, nan=0.0, posinf=0.0, neginf=0.0)
-
-
-# MERGED mjlab.managers.observation_manager: One observation term: from what its function returns to what the policy sees.
+Observation = torch.Tensor | dict[str, torch.Tensor]
 
 
 @dataclass
@@ -163,207 +72,6 @@ class ObservationTermCfg(ManagerTermBaseCfg):
     """True returns a history of H values as (num_envs, H * size), False as (num_envs, H, ...)."""
 
 
-@stateful
-class ObservationTerm:
-    """The pipeline of one term, with its delay, its history and its noise model.
-
-    Args:
-        label: "group/term", for messages.
-        cfg: Resolved config, owned by the manager. It is read at every call, so that a curriculum
-            may change noise, clip and scale; delay and history are fixed here.
-        env: The environment.
-        nan_policy: What to do with NaN and infinite values before they enter delay and history.
-
-    The term's function is called once, to learn its shape.
-
-    Raises `ValueError`, naming the term, for a clip, scale, delay or history that makes no sense,
-    and puts the term's name in front of what its function raises.
-
-    Attributes:
-        shape: Shape of the result without the environment dimension.
-    """
-
-    _transient = {"label", "shape", "_nan_policy"}
-
-    def __init__(
-        self,
-        label: str,
-        cfg: ObservationTermCfg,
-        env: ManagerBasedRlEnv,
-        nan_policy: NanPolicy = "disabled",
-    ) -> None:
-        self.label = label
-        self.cfg = cfg
-        self._env = env
-        self._nan_policy: NanPolicy = nan_policy
-        self._raw_shape = self._first_shape()
-        check_clip(label, cfg.clip)
-        if cfg.scale is not None:
-            cfg.scale = scale_tensor(label, cfg.scale, self._raw_shape, env.device)
-        with errors_named(self._name):
-            self._noise_model = self._build_noise_model()
-            self._delay = self._build_delay()
-            self._history = self._build_history()
-        self.shape = self._result_shape(tuple(self._raw_shape[1:]))
-
-    def compute(self, update_history: bool, env_ids: torch.Tensor | None) -> torch.Tensor:
-        """Return the value (num_envs, *shape), which may be memory of the simulation.
-
-        Args:
-            update_history: Whether the value enters the history.
-            env_ids: Environments that start an episode: their delay and history are filled with
-                the value, those of the others stay as they are. None is a step of all.
-        """
-        value = self._call()
-        cfg = self.cfg
-        if cfg.noise is not None:
-            # The noise may work in place, which must not reach the simulation.
-            value = self._with_noise(value.clone(), cfg.noise)
-        if cfg.clip is not None:
-            value = torch.clamp(value, cfg.clip[0], cfg.clip[1])
-        scale = self._scale_as_tensor()
-        if scale is not None:
-            value = value * scale
-        if self._nan_policy != "disabled":
-            value = apply_nan_policy(value, self._nan_policy, self.label)
-        if self._delay is not None:
-            value = self._delayed(self._delay, value, env_ids)
-        if self._history is not None:
-            value = self._with_history(self._history, value, update_history, env_ids)
-        return value
-
-    @property
-    def has_state(self) -> bool:
-        """Whether `reset` does anything."""
-        return any(part is not None for part in (self._noise_model, self._delay, self._history))
-
-    def reset(self, env_ids: torch.Tensor | slice | None) -> None:
-        """Empty delay and history and start the noise model anew in these environments."""
-        if self._delay is not None:
-            self._delay.reset(env_ids)
-        if self._history is not None:
-            self._history.reset(env_ids)
-        if self._noise_model is not None:
-            self._noise_model.reset(env_ids)
-
-    def _call(self) -> torch.Tensor:
-        value = self.cfg.func(self._env, **self.cfg.params)
-        if not isinstance(value, torch.Tensor):
-            self._check_first(value)
-        elif value.shape != self._raw_shape:
-            raise ValueError(
-                f"Observation term {self.label!r} returned shape {tuple(value.shape)}, but "
-                f"{tuple(self._raw_shape)} when the environment was built. Shapes must not change."
-            )
-        else:
-            check_real(f"Observation term {self.label!r}", value)
-        # Policies are float32, whatever the default type with which a term makes its tensors.
-        return value.float() if value.dtype == torch.float64 else value
-
-    def _check_first(self, value: Any) -> None:
-        expected = f"({self._env.num_envs}, ...), with one or more dimensions after the first"
-        if not isinstance(value, torch.Tensor):
-            raise TypeError(
-                f"Observation term {self.label!r} must return a tensor of shape {expected}, got "
-                f"{type(value).__name__}: {value!r}."
-            )
-        if value.ndim < 2 or value.shape[0] != self._env.num_envs:
-            hint = " Add `.unsqueeze(-1)` to return one number." if value.ndim == 1 else ""
-            raise ValueError(
-                f"Observation term {self.label!r} returned shape {tuple(value.shape)}, expected "
-                f"{expected}.{hint}"
-            )
-        check_real(f"Observation term {self.label!r}", value)
-
-    def _with_noise(self, value: torch.Tensor, noise: NoiseCfg | NoiseModelCfg) -> torch.Tensor:
-        if isinstance(noise, NoiseModelCfg):
-            if self._noise_model is None:
-                self._noise_model = self._build_noise_model()
-            return self._noise_model(value)
-        return noise.apply(value)
-
-    def _scale_as_tensor(self) -> torch.Tensor | None:
-        """Keep the scale as a float tensor on the device, also after someone has replaced it."""
-        scale = self.cfg.scale
-        if scale is not None and not isinstance(scale, torch.Tensor):
-            scale = scale_tensor(self.label, scale, self._raw_shape, self._env.device)
-            self.cfg.scale = scale
-        return scale
-
-    def _delayed(
-        self, delay: DelayBuffer, value: torch.Tensor, env_ids: torch.Tensor | None
-    ) -> torch.Tensor:
-        if env_ids is not None and delay.is_initialized:
-            delay.backfill(value, env_ids)
-            return delay.peek()
-        delay.append(value)
-        return delay.compute()
-
-    def _with_history(
-        self,
-        history: CircularBuffer,
-        value: torch.Tensor,
-        update_history: bool,
-        env_ids: torch.Tensor | None,
-    ) -> torch.Tensor:
-        if env_ids is not None and history.is_initialized:
-            history.backfill(value, env_ids)
-        elif update_history or not history.is_initialized:
-            history.append(value)
-        frames = history.buffer
-        return frames.flatten(1) if self.cfg.flatten_history_dim else frames
-
-    # Building.
-
-    @property
-    def _name(self) -> str:
-        return f"Observation term {self.label!r}"
-
-    def _first_shape(self) -> torch.Size:
-        with errors_named(self._name):
-            value = self.cfg.func(self._env, **self.cfg.params)
-        self._check_first(value)
-        return value.shape
-
-    def _build_noise_model(self) -> Any:
-        noise = self.cfg.noise
-        if not isinstance(noise, NoiseModelCfg):
-            return None
-        return noise.class_type(noise, num_envs=self._env.num_envs, device=self._env.device)
-
-    def _build_delay(self) -> DelayBuffer | None:
-        cfg = self.cfg
-        if cfg.delay_max_lag == 0 and cfg.delay_min_lag == 0:
-            return None
-        return DelayBuffer(
-            min_lag=cfg.delay_min_lag,
-            max_lag=cfg.delay_max_lag,
-            batch_size=self._env.num_envs,
-            device=self._env.device,
-            per_env=cfg.delay_per_env,
-            hold_prob=cfg.delay_hold_prob,
-            update_period=cfg.delay_update_period,
-            per_env_phase=cfg.delay_per_env_phase,
-        )
-
-    def _build_history(self) -> CircularBuffer | None:
-        length = self.cfg.history_length
-        if length == 0:
-            return None
-        return CircularBuffer(length, self._env.num_envs, self._env.device)
-
-    def _result_shape(self, shape: tuple[int, ...]) -> tuple[int, ...]:
-        if self._history is None:
-            return shape
-        with_history = (self.cfg.history_length, *shape)
-        if not self.cfg.flatten_history_dim:
-            return with_history
-        return (int(torch.Size(with_history).numel()),)
-
-
-# MERGED mjlab.managers.observation_manager: A group of observation terms: one tensor, or one dict of tensors, for one consumer.
-
-
 @dataclass
 class ObservationGroupCfg:
     """A named group of observation terms, such as "actor" or "critic"."""
@@ -388,107 +96,12 @@ class ObservationGroupCfg:
     flatten_history_dim: bool = True
     """How terms return their history where `history_length` is given here."""
 
-    nan_policy: Literal["disabled", "warn", "sanitize", "error"] = "disabled"
+    nan_policy: NanPolicy = "disabled"
     """What to do with NaN and infinite values: nothing, warn and replace by 0, replace by 0, or
     raise."""
 
     nan_check_per_term: bool = True
     """True checks each term before delay and history, False the group's result."""
-
-
-def check_group(name: str, cfg: ObservationGroupCfg) -> None:
-    """Raise `ValueError` if a setting of the group has no meaning."""
-    if cfg.nan_policy not in NAN_POLICIES:
-        raise ValueError(
-            f"Observation group {name!r}: nan_policy is {cfg.nan_policy!r}, but must be one of "
-            f"{NAN_POLICIES}."
-        )
-    if cfg.history_length is not None and cfg.history_length < 0:
-        raise ValueError(
-            f"Observation group {name!r}: history_length is {cfg.history_length}, but must be 0 or "
-            "more, or None to leave it to the terms."
-        )
-
-
-@stateful
-class ObservationGroup:
-    """The terms of one group, and how they are joined.
-
-    Args:
-        name: Name of the group.
-        cfg: Its config.
-        terms: Its terms by name; at least one.
-
-    Attributes:
-        shape: Shape of the joined tensor without the environment dimension, or None for a dict.
-
-    Raises `ValueError` if the terms cannot be joined.
-    """
-
-    _transient = {"name", "shape", "_dim", "_checks_result"}
-
-    def __init__(
-        self, name: str, cfg: ObservationGroupCfg, terms: dict[str, ObservationTerm]
-    ) -> None:
-        self.name = name
-        self.cfg = cfg
-        self.terms = terms
-        dim = cfg.concatenate_dim
-        self._dim = dim + 1 if dim >= 0 else dim
-        self._checks_result = cfg.nan_policy != "disabled" and not cfg.nan_check_per_term
-        self.shape = self._joined_shape() if cfg.concatenate_terms else None
-
-    def compute(
-        self, update_history: bool, env_ids: torch.Tensor | None
-    ) -> torch.Tensor | dict[str, torch.Tensor]:
-        """Return the group's observation in memory of its own."""
-        values = [term.compute(update_history, env_ids) for term in self.terms.values()]
-        if self.cfg.concatenate_terms:
-            # Joining copies, also a single tensor.
-            return self._checked(torch.cat(values, dim=self._dim), self.name)
-        return {
-            name: self._checked(value.clone(), f"{self.name}/{name}")
-            for name, value in zip(self.terms, values, strict=True)
-        }
-
-    def split(self, observation: torch.Tensor | dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Return the parts of a result of `compute` by term."""
-        if isinstance(observation, dict):
-            return observation
-        dim = self._axis() + 1
-        parts = observation.split([term.shape[dim - 1] for term in self.terms.values()], dim=dim)
-        return dict(zip(self.terms, parts, strict=True))
-
-    def _checked(self, value: torch.Tensor, label: str) -> torch.Tensor:
-        if not self._checks_result:
-            return value
-        return apply_nan_policy(value, self.cfg.nan_policy, label)
-
-    def _axis(self) -> int:
-        """Return the dimension to join along, counted without the environment dimension."""
-        dim = self.cfg.concatenate_dim
-        return dim if dim >= 0 else dim + len(next(iter(self.terms.values())).shape)
-
-    def _joined_shape(self) -> tuple[int, ...]:
-        shapes = {name: term.shape for name, term in self.terms.items()}
-        first, axis = next(iter(shapes.values())), self._axis()
-        for shape in shapes.values():
-            others_agree = (
-                len(shape) == len(first)
-                and 0 <= axis < len(first)
-                and shape[:axis] + shape[axis + 1 :] == first[:axis] + first[axis + 1 :]
-            )
-            if not others_agree:
-                raise ValueError(
-                    f"Observation group {self.name!r}: terms of shapes {shapes} (without the "
-                    f"environment dimension) cannot be joined along concatenate_dim="
-                    f"{self.cfg.concatenate_dim}. Flatten the terms, or set concatenate_terms="
-                    "False."
-                )
-        return (*first[:axis], sum(shape[axis] for shape in shapes.values()), *first[axis + 1 :])
-
-
-Observation = torch.Tensor | dict[str, torch.Tensor]
 
 
 @offers_older_attributes
@@ -503,7 +116,12 @@ class ObservationManager(ManagerBase):
     def __init__(
         self, cfg: Mapping[str, ObservationGroupCfg | None], env: ManagerBasedRlEnv
     ) -> None:
-        self.cfg = {name: _copy_group(group) for name, group in cfg.items()}
+        self.cfg = dict(cfg)
+        for name, group in cfg.items():
+            if isinstance(group, ObservationGroupCfg):
+                # Each term is copied by itself, so that groups that share terms share no state.
+                terms = {key: copy.deepcopy(term) for key, term in group.terms.items()}
+                self.cfg[name] = dataclasses.replace(group, terms=terms)
         self._groups: dict[str, ObservationGroup] = {}
         self._obs_buffer: dict[str, Observation] | None = None
         super().__init__(env)
@@ -605,11 +223,7 @@ class ObservationManager(ManagerBase):
         Raises `ValueError`, with the valid names, if there is no such group or term.
         """
         terms = self._group(group_name).terms
-        if term_name not in terms:
-            raise ValueError(
-                f"Observation group {group_name!r} has no term {term_name!r}. "
-                f"Its terms: {list(terms)}."
-            )
+        check_exists(f"term of observation group {group_name!r}", term_name, terms)
         return terms[term_name].cfg
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
@@ -623,38 +237,37 @@ class ObservationManager(ManagerBase):
 
     def _prepare_terms(self) -> None:
         for name, group_cfg in self._enabled(self.cfg, ObservationGroupCfg):
-            check_group(name, group_cfg)
+            label = f"Observation group {name!r}"
+            check_one_of(f"{label} nan_policy", group_cfg.nan_policy, get_args(NanPolicy))
+            if group_cfg.history_length is not None:
+                check_count(f"{label} history_length", group_cfg.history_length, minimum=0)
             terms = {
-                term_name: self._build_term(name, group_cfg, term_name, term_cfg)
+                term_name: self._build_term(f"{name}/{term_name}", term_cfg, group_cfg)
                 for term_name, term_cfg in self._enabled(group_cfg.terms, ObservationTermCfg)
             }
             if terms:
                 self._groups[name] = ObservationGroup(name, group_cfg, terms)
 
     def _build_term(
-        self,
-        group_name: str,
-        group_cfg: ObservationGroupCfg,
-        term_name: str,
-        term_cfg: ObservationTermCfg,
+        self, label: str, cfg: ObservationTermCfg, group_cfg: ObservationGroupCfg
     ) -> ObservationTerm:
-        label = f"{group_name}/{term_name}"
         # Also where there is no corruption, which would hide a mistake until someone turns it on.
-        check_noise(label, term_cfg.noise)
+        if not (cfg.noise is None or isinstance(cfg.noise, NoiseCfg | NoiseModelCfg)):
+            raise ValueError(
+                f"Observation term {label!r} noise: expected a NoiseCfg (UniformNoiseCfg("
+                f"n_min=-0.1, n_max=0.1), say), a NoiseModelCfg, or None, got {cfg.noise!r}."
+            )
         if not group_cfg.enable_corruption:
-            term_cfg.noise = None
+            cfg.noise = None
         if group_cfg.history_length is not None:
-            term_cfg.history_length = group_cfg.history_length
-            term_cfg.flatten_history_dim = group_cfg.flatten_history_dim
-        self._resolve_term(label, term_cfg, ("env",))
+            cfg.history_length = group_cfg.history_length
+            cfg.flatten_history_dim = group_cfg.flatten_history_dim
+        self._resolve_term(label, cfg, ("env",))
         policy = group_cfg.nan_policy if group_cfg.nan_check_per_term else "disabled"
-        return ObservationTerm(label, term_cfg, self._env, policy)
+        return ObservationTerm(label, cfg, self._env, policy)
 
     def _group(self, name: str) -> ObservationGroup:
-        if name not in self._groups:
-            raise ValueError(
-                f"ObservationManager has no group {name!r}. Its groups: {list(self._groups)}."
-            )
+        check_exists("observation group", name, self._groups)
         return self._groups[name]
 
     def _live_cfgs(self) -> dict[str, Any]:
@@ -663,17 +276,294 @@ class ObservationManager(ManagerBase):
         }
 
     def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
-        return ["group", "name", "shape"], list(self._rows())
+        rows = [
+            (group_name, term_name, term.shape)
+            for group_name, group in self._groups.items()
+            for term_name, term in group.terms.items()
+        ]
+        return ["group", "name", "shape"], rows
 
-    def _rows(self) -> Iterator[Sequence[Any]]:
-        for group_name, group in self._groups.items():
-            for term_name, term in group.terms.items():
-                yield group_name, term_name, term.shape
+
+@stateful
+class ObservationGroup:
+    """The terms of one group, and how they are joined.
+
+    Args:
+        name: Name of the group.
+        cfg: Its config.
+        terms: Its terms by name; at least one.
+
+    Attributes:
+        shape: Shape of the joined tensor without the environment dimension, or None for a dict.
+
+    Raises `ValueError` if the terms cannot be joined.
+    """
+
+    _transient = {"name", "shape", "_dim", "_nan_policy"}
+
+    def __init__(
+        self, name: str, cfg: ObservationGroupCfg, terms: dict[str, ObservationTerm]
+    ) -> None:
+        self.name = name
+        self.cfg = cfg
+        self.terms = terms
+        dim = cfg.concatenate_dim
+        self._dim = dim + 1 if dim >= 0 else dim
+        self._nan_policy: NanPolicy = "disabled" if cfg.nan_check_per_term else cfg.nan_policy
+        self.shape = self._joined_shape() if cfg.concatenate_terms else None
+
+    def compute(
+        self, update_history: bool, env_ids: torch.Tensor | None
+    ) -> torch.Tensor | dict[str, torch.Tensor]:
+        """Return the group's observation in memory of its own."""
+        values = [term.compute(update_history, env_ids) for term in self.terms.values()]
+        if self.cfg.concatenate_terms:
+            # Joining copies, also a single tensor.
+            return apply_nan_policy(torch.cat(values, dim=self._dim), self._nan_policy, self.name)
+        return {
+            name: apply_nan_policy(value.clone(), self._nan_policy, f"{self.name}/{name}")
+            for name, value in zip(self.terms, values, strict=True)
+        }
+
+    def split(self, observation: torch.Tensor | dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Return the parts of a result of `compute` by term."""
+        if isinstance(observation, dict):
+            return observation
+        dim = self._axis() + 1
+        parts = observation.split([term.shape[dim - 1] for term in self.terms.values()], dim=dim)
+        return dict(zip(self.terms, parts, strict=True))
+
+    def _axis(self) -> int:
+        """Return the dimension to join along, counted without the environment dimension."""
+        dim = self.cfg.concatenate_dim
+        return dim if dim >= 0 else dim + len(next(iter(self.terms.values())).shape)
+
+    def _joined_shape(self) -> tuple[int, ...]:
+        shapes = {name: term.shape for name, term in self.terms.items()}
+        first, axis = next(iter(shapes.values())), self._axis()
+        for shape in shapes.values():
+            others_agree = (
+                len(shape) == len(first)
+                and 0 <= axis < len(first)
+                and shape[:axis] + shape[axis + 1 :] == first[:axis] + first[axis + 1 :]
+            )
+            if not others_agree:
+                raise ValueError(
+                    f"Observation group {self.name!r}: terms of shapes {shapes} (without the "
+                    f"environment dimension) cannot be joined along concatenate_dim="
+                    f"{self.cfg.concatenate_dim}. Flatten the terms, or set concatenate_terms="
+                    "False."
+                )
+        return (*first[:axis], sum(shape[axis] for shape in shapes.values()), *first[axis + 1 :])
 
 
-def _copy_group(group: ObservationGroupCfg | None) -> ObservationGroupCfg | None:
-    """Copy a group and each of its terms, so that groups that share terms do not share state."""
-    if not isinstance(group, ObservationGroupCfg):
-        return group
-    terms = {name: copy.deepcopy(term) for name, term in group.terms.items()}
-    return dataclasses.replace(group, terms=terms)
+@stateful
+class ObservationTerm:
+    """The pipeline of one term, with its delay, its history and its noise model.
+
+    Args:
+        label: "group/term", for messages.
+        cfg: Resolved config, owned by the manager. It is read at every call, so that a curriculum
+            may change noise, clip and scale; delay and history are fixed here.
+        env: The environment.
+        nan_policy: What to do with NaN and infinite values before they enter delay and history.
+
+    The term's function is called once, to learn its shape.
+
+    Raises `ValueError`, naming the term, for a clip, scale, delay or history that makes no sense,
+    and puts the term's name in front of what its function raises.
+
+    Attributes:
+        shape: Shape of the result without the environment dimension.
+    """
+
+    _transient = {"label", "shape", "_name", "_nan_policy"}
+
+    def __init__(
+        self,
+        label: str,
+        cfg: ObservationTermCfg,
+        env: ManagerBasedRlEnv,
+        nan_policy: NanPolicy = "disabled",
+    ) -> None:
+        self.label, self._name = label, f"Observation term {label!r}"
+        self.cfg = cfg
+        self._env = env
+        self._nan_policy: NanPolicy = nan_policy
+        with label_errors(self._name):
+            value = cfg.func(env, **cfg.params)
+        self._check_first(value)
+        self._raw_shape = value.shape
+        if cfg.clip is not None and not is_interval(cfg.clip):
+            raise ValueError(
+                f"{self._name} clip: expected (low, high) with low <= high, or None, got "
+                f"{cfg.clip!r}."
+            )
+        if cfg.scale is not None:
+            cfg.scale = scale_tensor(self._name, cfg.scale, self._raw_shape, env.device)
+        with label_errors(self._name):
+            self._noise_model = self._build_noise_model()
+            self._delay = self._build_delay()
+            self._history = None
+            if cfg.history_length != 0:
+                self._history = CircularBuffer(cfg.history_length, env.num_envs, env.device)
+        self.shape: tuple[int, ...] = tuple(self._raw_shape[1:])
+        if self._history is not None:
+            with_history = torch.Size((cfg.history_length, *self.shape))
+            flat = (with_history.numel(),)
+            self.shape = flat if cfg.flatten_history_dim else tuple(with_history)
+
+    def compute(self, update_history: bool, env_ids: torch.Tensor | None) -> torch.Tensor:
+        """Return the value (num_envs, *shape), which may be memory of the simulation.
+
+        Args:
+            update_history: Whether the value enters the history.
+            env_ids: Environments that start an episode: their delay and history are filled with
+                the value, those of the others stay as they are. None is a step of all.
+        """
+        value = self._call()
+        cfg = self.cfg
+        if cfg.noise is not None:
+            # The noise may work in place, which must not reach the simulation.
+            value = value.clone()
+            if not isinstance(cfg.noise, NoiseModelCfg):
+                value = cfg.noise.apply(value)
+            else:
+                # A curriculum may have set it.
+                if self._noise_model is None:
+                    self._noise_model = self._build_noise_model()
+                value = self._noise_model(value)
+        if cfg.clip is not None:
+            value = torch.clamp(value, cfg.clip[0], cfg.clip[1])
+        if cfg.scale is not None:
+            if not isinstance(cfg.scale, torch.Tensor):
+                cfg.scale = scale_tensor(self._name, cfg.scale, self._raw_shape, self._env.device)
+            value = value * cfg.scale
+        if self._nan_policy != "disabled":
+            value = apply_nan_policy(value, self._nan_policy, self.label)
+        if self._delay is not None:
+            if env_ids is not None and self._delay.is_initialized:
+                self._delay.backfill(value, env_ids)
+                value = self._delay.peek()
+            else:
+                self._delay.append(value)
+                value = self._delay.compute()
+        if self._history is not None:
+            if env_ids is not None and self._history.is_initialized:
+                self._history.backfill(value, env_ids)
+            elif update_history or not self._history.is_initialized:
+                self._history.append(value)
+            frames = self._history.buffer
+            value = frames.flatten(1) if cfg.flatten_history_dim else frames
+        return value
+
+    @property
+    def has_state(self) -> bool:
+        """Whether `reset` does anything."""
+        return any(part is not None for part in (self._noise_model, self._delay, self._history))
+
+    def reset(self, env_ids: torch.Tensor | slice | None) -> None:
+        """Empty delay and history and start the noise model anew in these environments."""
+        for part in (self._delay, self._history, self._noise_model):
+            if part is not None:
+                part.reset(env_ids)
+
+    def _call(self) -> torch.Tensor:
+        value = self.cfg.func(self._env, **self.cfg.params)
+        if not isinstance(value, torch.Tensor):
+            self._check_first(value)
+        elif value.shape != self._raw_shape:
+            raise ValueError(
+                f"{self._name} returned shape {tuple(value.shape)}, but {tuple(self._raw_shape)} "
+                "when the environment was built. Shapes must not change."
+            )
+        check_real(value, str, self._name)
+        # Policies are float32, whatever the default type with which a term makes its tensors.
+        return value.float() if value.dtype == torch.float64 else value
+
+    def _check_first(self, value: Any) -> None:
+        expected = f"({self._env.num_envs}, ...), with one or more dimensions after the first"
+        if not isinstance(value, torch.Tensor):
+            raise WrongTypeError(
+                f"{self._name} must return a tensor of shape {expected}, got "
+                f"{type(value).__name__}: {value!r}."
+            )
+        if value.ndim < 2 or value.shape[0] != self._env.num_envs:
+            hint = " Add `.unsqueeze(-1)` to return one number." if value.ndim == 1 else ""
+            raise ValueError(
+                f"{self._name} returned shape {tuple(value.shape)}, expected {expected}.{hint}"
+            )
+        check_real(value, str, self._name)
+
+    def _build_noise_model(self) -> Any:
+        noise = self.cfg.noise
+        if not isinstance(noise, NoiseModelCfg):
+            return None
+        return noise.class_type(noise, num_envs=self._env.num_envs, device=self._env.device)
+
+    def _build_delay(self) -> DelayBuffer | None:
+        cfg = self.cfg
+        if cfg.delay_max_lag == 0 and cfg.delay_min_lag == 0:
+            return None
+        return DelayBuffer(
+            min_lag=cfg.delay_min_lag,
+            max_lag=cfg.delay_max_lag,
+            batch_size=self._env.num_envs,
+            device=self._env.device,
+            per_env=cfg.delay_per_env,
+            hold_prob=cfg.delay_hold_prob,
+            update_period=cfg.delay_update_period,
+            per_env_phase=cfg.delay_per_env_phase,
+        )
+
+
+def scale_tensor(label: str, scale: Any, raw_shape: torch.Size, device: str) -> torch.Tensor:
+    """Return `scale` as a tensor that multiplies values of `raw_shape` (num_envs, ...).
+
+    A tensor is returned as it is, anything else as float32 on `device`.
+
+    Raises `ValueError` if it is no number or numbers, or does not fit `raw_shape`.
+    """
+    tensor = scale
+    if not isinstance(scale, torch.Tensor):
+        try:
+            tensor = torch.tensor(scale, dtype=torch.float32, device=device)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ValueError(
+                f"{label} scale: expected one number, one for each component, or None, got "
+                f"{scale!r}."
+            ) from error
+    try:
+        # A larger result would mean that the scale stretches the observation.
+        fits = torch.broadcast_shapes(tensor.shape, raw_shape) == raw_shape
+    except RuntimeError:
+        fits = False
+    if not fits:
+        raise ValueError(
+            f"{label} scale: expected one number, or one for each of the {raw_shape[-1]} components "
+            f"of the last axis of the term's value {tuple(raw_shape)}, got shape "
+            f"{tuple(tensor.shape)}."
+        )
+    return tensor
+
+
+def apply_nan_policy(value: torch.Tensor, policy: NanPolicy, label: str) -> torch.Tensor:
+    """Return `value` (num_envs, ...) after the policy.
+
+    "disabled" looks at nothing, "sanitize" replaces NaN and infinite numbers by 0, "warn" logs the
+    environments first, and "error" raises `ValueError` with `label` and up to 10 environments.
+    """
+    if policy == "disabled":
+        return value
+    if policy != "sanitize":
+        bad = ~torch.isfinite(value).flatten(1).all(dim=1)
+        if not bad.any():
+            return value
+        ids = bad.nonzero().flatten()
+        shown = ids[: 10 if policy == "error" else 5].tolist()
+        message = f"Observation {label!r} is NaN or infinite in {len(ids)} environments: {shown}"
+        message += " and others." if len(ids) > len(shown) else "."
+        if policy == "error":
+            raise ValueError(message)
+        logger.warning("%s Replaced by 0.", message)
+    return torch.nan_to_num(value, nan=0.0, posinf=0.0, neginf=0.0)

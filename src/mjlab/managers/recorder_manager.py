@@ -12,10 +12,11 @@ import torch
 from mjlab.managers.manager_base import (
     ManagerTermBase,
     ManagerTermBaseCfg,
+    NullManager,
     TermListManager,
-    errors_named,
+    label_errors,
 )
-from mjlab.managers.null_managers import NullRecorderManager as NullRecorderManager
+from mjlab.utils.errors import UnknownNameError, UnsupportedError, WrongTypeError
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -35,7 +36,7 @@ class RecorderTerm(ManagerTermBase):
 
     def __call__(self) -> None:
         """Raise `NotImplementedError`: recorders have hooks instead."""
-        raise NotImplementedError(
+        raise UnsupportedError(
             f"{self.name} is not called; override its hooks, such as record_post_step."
         )
 
@@ -70,8 +71,7 @@ class RecorderManager(TermListManager):
 
     def get_term(self, name: str) -> RecorderTerm:
         """Return a recorder; raises `KeyError`, with the valid names, if there is none."""
-        if name not in self._terms:
-            self._unknown(name, self._term_names, KeyError)
+        self._check_known(name, self._term_names, UnknownNameError)
         return self._terms[name]
 
     def record_pre_reset(self, env_ids: torch.Tensor) -> None:
@@ -98,14 +98,18 @@ class RecorderManager(TermListManager):
         self._term_names, self._term_cfgs = [], []
         for name, cfg in self._enabled(self.cfg, RecorderTermCfg, quiet=True):
             if not (inspect.isclass(cfg.func) and issubclass(cfg.func, RecorderTerm)):
-                raise TypeError(
+                raise WrongTypeError(
                     f"{self._label(name)}: func must be a subclass of RecorderTerm, got "
                     f"{cfg.func!r}."
                 )
             self._resolve_params(name, cfg)
-            with errors_named(self._label(name)):
+            with label_errors(self._label(name)):
                 term = cfg.func(cfg, self._env)
             cfg.func = term
             self._terms[name] = term
             self._term_names.append(name)
             self._term_cfgs.append(cfg)
+
+
+class NullRecorderManager(NullManager, RecorderManager):
+    """Recorder manager without terms."""

@@ -15,7 +15,6 @@ from mjlab.managers.manager_base import (
     ManagerTermBaseCfg,
     TermFunctionSwitches,
     TermListManager,
-    UnreadyTerm,
 )
 from mjlab.managers.nonfinite import NonFiniteWatch
 from mjlab.utils.indexing import as_index, is_empty
@@ -48,6 +47,7 @@ class RewardManager(TermFunctionSwitches, TermListManager):
     """
 
     _cfg_type = RewardTermCfg
+    _shown = ("weight",)
     # Views of `_rates`.
     _transient = {"_step_reward", "_rows", "_scale_by_dt", "nonfinite"}
 
@@ -127,7 +127,10 @@ class RewardManager(TermFunctionSwitches, TermListManager):
 
     def _prepare_terms(self) -> None:
         for name, cfg in self.cfg.items():
-            if isinstance(cfg, RewardTermCfg) and not _is_number(cfg.weight):
+            # A weight that is NaN would silently turn the term off: NaN rewards count as 0.
+            if isinstance(cfg, RewardTermCfg) and not (
+                isinstance(cfg.weight, Real) and math.isfinite(cfg.weight)
+            ):
                 raise ValueError(
                     f"{self._label(name)}: weight is {cfg.weight!r}, but must be a finite number. "
                     "To switch the term off, set the weight to 0 or the whole term to None."
@@ -150,27 +153,18 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         else:
             return
 
-        def build_later() -> Any:
+        def build_and_call(env: Any, **params: Any) -> Any:
             cfg.func = given
             try:
                 build_now(name, cfg, leading)
             except Exception:
-                cfg.func = unready
+                cfg.func = build_and_call
                 raise
-            return cfg.func
+            return cfg.func(env, **params)
 
-        cfg.func = unready = UnreadyTerm(build_later)
+        cfg.func = build_and_call
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
         """Return, for one environment, the weighted rate of each term in the last step."""
         rates = self._step_reward[env_idx].tolist()
         return [(name, [rate]) for name, rate in zip(self._term_names, rates, strict=True)]
-
-    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
-        terms = zip(self._term_names, self._term_cfgs, strict=True)
-        return ["name", "weight"], [(name, cfg.weight) for name, cfg in terms]
-
-
-def _is_number(value: Any) -> bool:
-    # A weight that is NaN would silently turn the term off, because NaN rewards count as 0.
-    return isinstance(value, Real) and math.isfinite(value)

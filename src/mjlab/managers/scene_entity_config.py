@@ -120,7 +120,17 @@ class SceneEntityCfg:
         if names is None:
             return self._names_at(kind, ids, all_names), ids
         given = [names] if isinstance(names, str) else list(names)
-        found_ids, found_names = self._find(kind, given, all_names, entity)
+        found_ids, found_names = [], []
+        if given:
+            # A plain name may hold characters that mean something in a pattern; names that were
+            # resolved before must find themselves.
+            patterns = [re.escape(name) if name in all_names else name for name in given]
+            find = getattr(entity, _FINDERS[kind])
+            try:
+                found_ids, found_names = find(tuple(patterns), preserve_order=self.preserve_order)
+            except ValueError as error:
+                raise ValueError(f"entity {self.name!r}, {kind}_names={given}: {error}") from error
+        found_ids, found_names = list(found_ids), list(found_names)
         if isinstance(ids, slice):
             everything = found_ids == list(range(len(all_names)))
             return found_names, slice(None) if everything else found_ids
@@ -132,21 +142,6 @@ class SceneEntityCfg:
                 f"{kind}_ids={given_ids} (named {at_ids}) do not agree. Give only one of them."
             )
         return given, ids
-
-    def _find(
-        self, kind: str, given: list[str], all_names: list[str], entity: Any
-    ) -> tuple[list[int], list[str]]:
-        if not given:
-            return [], []
-        # A plain name may hold characters that mean something in a pattern; names that were
-        # resolved before must find themselves.
-        patterns = [re.escape(name) if name in all_names else name for name in given]
-        try:
-            find = getattr(entity, _FINDERS[kind])
-            ids, names = find(tuple(patterns), preserve_order=self.preserve_order)
-        except ValueError as error:
-            raise ValueError(f"entity {self.name!r}, {kind}_names={given}: {error}") from error
-        return list(ids), list(names)
 
     def _names_at(self, kind: str, ids: list[int], all_names: list[str]) -> list[str]:
         outside = [i for i in ids if not -len(all_names) <= i < len(all_names)]

@@ -1,27 +1,22 @@
-"""TODO."""
+"""Checks of terms: those a term function brings for the manager to make, and those terms share."""
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from numbers import Real
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 
 from mjlab.sensor import ContactSensor
-from mjlab.utils.string import name_list
+from mjlab.utils.errors import WrongTypeError, check_exists, check_positive
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
-
-# MERGED mjlab.managers.term_checks: Checks that a term which is a function brings along, for the manager to make when it is built.
-#
-# A class has its constructor for this. A function would notice a sensor that does not exist only at
-# the first step, and columns in another order never.
-
 F = TypeVar("F", bound=Callable[..., Any])
+S = TypeVar("S")
 _ATTRIBUTE = "check_when_built"
 
 
@@ -31,6 +26,9 @@ def checked_when_built(check: Callable[..., None]) -> Callable[[F], F]:
     `check` gets the parameters of the term's config, selections resolved, and raises `ValueError`,
     `KeyError` or `TypeError` if the term could not work with them. It should take `**_` for those
     that it does not look at.
+
+    A class has its constructor for this. A function would notice a sensor that does not exist only
+    at the first step, and columns in another order never.
     """
 
     def mark(function: F) -> F:
@@ -47,18 +45,7 @@ def check_term(function: Any, env: ManagerBasedRlEnv, params: dict[str, Any]) ->
         check(env, **params)
 
 
-# MERGED mjlab.managers.term_checks: What terms of several tasks refuse when they are built: wrong names, sensors, ranges, numbers.
-
-S = TypeVar("S")
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Return what to say about the names that exist: the nearest ones, or all if they are few."""
-    names = list(known)
-    close = difflib.get_close_matches(name, names)
-    if close:
-        return f"Did you mean {' or '.join(map(repr, close))}?"
-    return f"There are: {name_list(names, near=())}."
+# Scene and commands.
 
 
 def require_sensor(env: ManagerBasedRlEnv, name: str, kind: type[S]) -> S:
@@ -72,14 +59,13 @@ def require_sensor(env: ManagerBasedRlEnv, name: str, kind: type[S]) -> S:
     if name not in sensors:
         # A contact sensor is made of MuJoCo's own, one for each of its parts, that nobody asks for.
         contacts = tuple(f"{n}_" for n, s in sensors.items() if isinstance(s, ContactSensor))
-        known = [n for n in sensors if not n.startswith(contacts)]
-        raise ValueError(f"The scene has no sensor {name!r}. {nearest(name, known)}")
+        check_exists("sensor", name, [n for n in sensors if not n.startswith(contacts)])
     sensor: Any = sensors[name]
     if not isinstance(sensor, kind):
         same_kind = [other for other, s in sensors.items() if isinstance(s, kind)]
-        raise TypeError(
-            f"The sensor {name!r} is a {type(sensor).__name__}, and a {kind.__name__} is needed. "
-            f"Such are: {same_kind}."
+        raise WrongTypeError(
+            f"Sensor {name!r}: expected {kind.__name__}, got {type(sensor).__name__}. "
+            f"Available: {same_kind}."
         )
     return sensor
 
@@ -102,20 +88,21 @@ def check_contact_sensor(env: ManagerBasedRlEnv, sensor_name: str, **params: Any
         require_fields(sensor, "found")
     threshold = params.get("force_threshold", 0.0)
     if not threshold >= 0.0:
-        raise ValueError(f"force_threshold is {threshold!r}; it is a force in newtons, at least 0.")
+        raise ValueError(f"force_threshold: expected a force >= 0 (N), got {threshold!r}.")
 
 
 def require_command(env: ManagerBasedRlEnv, name: str | None) -> None:
     """Raise `ValueError` unless there is a command of that name, or `name` is None."""
-    names = env.command_manager.active_terms
-    if name is not None and name not in names:
-        raise ValueError(f"There is no command {name!r}. {nearest(name, names)}")
+    if name is not None:
+        check_exists("command", name, env.command_manager.active_terms)
+
+
+# Values.
 
 
 def check_std(std: float) -> None:
     """Raise `ValueError` unless a standard deviation is positive."""
-    if not std > 0.0:
-        raise ValueError(f"std is {std!r}; it has to be positive.")
+    check_positive("std", std)
 
 
 def check_range(label: str, bounds: Any) -> None:
@@ -125,17 +112,21 @@ def check_range(label: str, bounds: Any) -> None:
     except (TypeError, ValueError):
         low, high = math.nan, math.nan
     if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-        turned = " They are the wrong way round." if low > high else ""
-        raise ValueError(
-            f"{label} is {bounds!r}; it has to be two finite numbers, the smaller one first.{turned}"
-        )
+        raise ValueError(f"{label}: expected finite (low, high) with low <= high, got {bounds!r}.")
 
 
-# MERGED mjlab.managers.term_checks: Refusing tensors that torch would cast in silence, or fail on without saying whose they are.
+def is_interval(bounds: Any) -> bool:
+    """Return True for two real numbers (low, high) with low <= high, which NaN is not."""
+    is_pair = isinstance(bounds, tuple | list) and len(bounds) == 2
+    return is_pair and all(isinstance(b, Real) for b in bounds) and bounds[0] <= bounds[1]
 
 
-def check_real(label: str, value: torch.Tensor) -> None:
-    """Raise TypeError, with `label`, for complex numbers, and for a tensor without data (`meta`)."""
+def check_real(value: torch.Tensor, label: Callable[..., str], *args: Any) -> None:
+    """Raise `TypeError` for complex numbers, and for a tensor without data (`meta`).
+
+    torch would cast the former in silence, and fail on the latter without saying whose it is.
+    `label(*args)` opens the message.
+    """
     if value.is_complex() or value.is_meta:
         kind = "the device meta" if value.is_meta else str(value.dtype).removeprefix("torch.")
-        raise TypeError(f"{label}: expected real numbers, got a tensor of {kind}.")
+        raise WrongTypeError(f"{label(*args)}: expected real numbers, got a tensor of {kind}.")

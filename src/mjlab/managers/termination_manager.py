@@ -12,6 +12,7 @@ import torch
 from mjlab.compat import offers_older_attributes
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
 from mjlab.managers.nonfinite import NonFiniteWatch
+from mjlab.utils.errors import UnknownNameError
 from mjlab.utils.indexing import as_index, is_empty
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ class TerminationManager(TermListManager):
     """Decides which episodes end. All results are buffers that the next step overwrites."""
 
     _cfg_type = TerminationTermCfg
+    _shown = ("time_out",)
     _transient = {"_rows", "_numeric", "nonfinite"}
 
     def __init__(
@@ -72,7 +74,8 @@ class TerminationManager(TermListManager):
     def compute(self) -> torch.Tensor:
         """Evaluate all terms and return `dones`.
 
-        A term that returns floats is logged the first time: what is not 0 counts as true, also NaN. Raises `ValueError` if a term returns another shape than (num_envs,).
+        A term that returns floats is logged the first time: what is not 0 counts as true, also NaN.
+        Raises `ValueError` if a term returns another shape than (num_envs,).
         """
         self._terminated.zero_()
         self._time_outs.zero_()
@@ -81,7 +84,13 @@ class TerminationManager(TermListManager):
             value = cfg.func(self._env, **cfg.params)
             self._check_value(name, value)
             if value.is_floating_point():
-                self._take_numbers(k, name, value)
+                if k not in self._numeric:
+                    logger.warning(
+                        "%s returned %s, expected bool: what is not 0 counts as true. Compare the "
+                        "value in the term.",
+                        *(self._label(name), str(value.dtype).removeprefix("torch.")),
+                    )
+                self._numeric[k] = torch.where((value == 0) | (value == 1), 0.0, torch.nan)
             row.copy_(value)
             (self._time_outs if cfg.time_out else self._terminated).logical_or_(row)
         if self._numeric:
@@ -90,21 +99,12 @@ class TerminationManager(TermListManager):
             self.nonfinite.look(torch.stack(rows))
         return torch.logical_or(self._terminated, self._time_outs, out=self._dones)
 
-    def _take_numbers(self, k: int, name: str, value: torch.Tensor) -> None:
-        if k not in self._numeric:
-            logger.warning(
-                "%s returned %s, expected bool: what is not 0 counts as true. Compare the value in the "
-                "term.", self._label(name), str(value.dtype).removeprefix("torch."),
-            )  # fmt: skip
-        self._numeric[k] = torch.where((value == 0) | (value == 1), 0.0, torch.nan)
-
     def get_term(self, name: str) -> torch.Tensor:
         """Return the last value of a term, (num_envs,) bool.
 
         Raises `KeyError`, with the valid names, if there is no such term.
         """
-        if name not in self._term_names:
-            self._unknown(name, self._term_names, KeyError)
+        self._check_known(name, self._term_names, UnknownNameError)
         return self._rows[self._term_names.index(name)]
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
@@ -122,7 +122,3 @@ class TerminationManager(TermListManager):
         """Return, for one environment, 1 for each term that was true in the last step, else 0."""
         values = self._values[:, env_idx].tolist()
         return [(name, [float(v)]) for name, v in zip(self._term_names, values, strict=True)]
-
-    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
-        terms = zip(self._term_names, self._term_cfgs, strict=True)
-        return ["name", "time out"], [(name, cfg.time_out) for name, cfg in terms]

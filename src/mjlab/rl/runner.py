@@ -367,7 +367,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
 
         Only in the first process: False in others.
         """
-        if not self._writes:
+        if not self._is_main_process:
             return False
         check = self._solved_check
         check.last_iteration = iteration
@@ -395,7 +395,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         Raises:
             CheckpointError: it could not be written; an earlier file at `path` is intact.
         """
-        if not self._writes:
+        if not self._is_main_process:
             return
         observations = self._observations
         if observations is None:
@@ -563,14 +563,14 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             }
 
     @property
-    def _writes(self) -> bool:
-        """Whether this process writes files: the first one does."""
+    def _is_main_process(self) -> bool:
+        """True in the first process, which alone writes files."""
         return self.gpu_global_rank == 0
 
     @property
     def _run_folder(self) -> str | None:
         """Run folder; None in processes that write nothing."""
-        return self.logger.log_dir if self._writes else None
+        return self.logger.log_dir if self._is_main_process else None
 
     @property
     def _replay(self) -> ReplayStorage | None:
@@ -616,5 +616,5 @@ class ExportingOnPolicyRunner(MjlabOnPolicyRunner):
             CheckpointError: the checkpoint could not be written.
         """
         super().save(path, infos)
-        if self._writes:
+        if self._is_main_process:
             self.export_policy(str(self._get_export_paths(path)[2]))

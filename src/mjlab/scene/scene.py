@@ -1,4 +1,9 @@
-"""The scene: terrain, entities and sensors, composed into one MuJoCo spec."""
+"""The scene: terrain, entities and sensors, composed into one MuJoCo spec.
+
+`MujocoCfg` decides every simulation option that it has a field for, whatever the XML of an entity
+says; its flags are added to those of the XML. Other options come from the XML, unless entities or
+`SceneCfg.spec_fn` contradict each other.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import mujoco
 import numpy as np
@@ -27,215 +32,19 @@ from mjlab.sensor import (
 from mjlab.sim.config import MujocoCfg
 from mjlab.sim.engine import Stage
 from mjlab.terrains.terrain_entity import TerrainEntity, TerrainEntityCfg
+from mjlab.utils.errors import UnknownNameError, check_count
 from mjlab.utils.indexing import EnvIds
 from mjlab.utils.mujoco import OPTION_ENUMS, flag_names
 from mjlab.utils.spec import attach, compile_composed, export_spec, make_asset_paths_absolute
 from mjlab.utils.state import stateful
 
-if TYPE_CHECKING:
-    from mjlab.sim import MujocoCfg
+TERRAIN = "terrain"
 
-
-# MERGED mjlab.scene.scene: The spec that a scene starts from: how it looks, and nothing else.
-
-
-def make_base_spec(extent: float | None) -> mujoco.MjSpec:
-    """Return a spec without elements or options, with mjlab's visual defaults.
-
-    `extent` is the size of the scene for viewers, in metres; None lets the compiler compute it.
-    """
-    spec = mujoco.MjSpec()
-    spec.modelname = "mjlab scene"
-    visual = spec.visual
-    visual.headlight.diffuse[:] = 0.6
-    visual.headlight.ambient[:] = 0.3
-    visual.headlight.specular[:] = 0.0
-    visual.rgba.force[:] = (1.0, 0.0, 0.0, 1.0)
-    visual.rgba.haze[:] = (0.15, 0.25, 0.35, 1.0)
-    visual.global_.azimuth = 135
-    visual.global_.elevation = -25
-    visual.global_.offwidth = 1920
-    visual.global_.offheight = 1080
-    visual.map.force = 0.005
-    visual.scale.forcewidth = 0.25
-    visual.scale.contactwidth = 0.4
-    visual.scale.contactheight = 0.15
-    visual.scale.framelength = 5.0
-    visual.scale.framewidth = 0.3
-    visual.quality.shadowsize = 8192
-    spec.stat.meansize = 0.03
-    if extent is not None:
-        spec.stat.extent = extent
-    return spec
-
-
-# MERGED mjlab.scene.scene: Simulation options in the XML of entities: decided by `MujocoCfg`, or applied to the scene.
-#
-# `MujocoCfg` decides every option that it has a field for, whatever the XML says; its flags are added
-# to those of the XML. Other options come from the XML, unless entities or `SceneCfg.spec_fn`
-# contradict each other.
-
-logger = logging.getLogger(__name__)
+# Options that `MujocoCfg` decides, and its flags, which are added to those of the XML.
 _DECIDED = frozenset(field.name for field in dataclasses.fields(MujocoCfg)) - set(BIT_FIELDS)
 _FLAGS = ("disableflags", "enableflags")
 
-
-@dataclass(frozen=True)
-class OptionRequest:
-    """A value for a simulation option, and the entities that ask for it."""
-
-    value: Any
-    entities: tuple[str, ...]
-
-
-def merge_entity_options(options: dict[str, EntityOptions]) -> dict[str, OptionRequest]:
-    """Return what the entities ask for together, beyond what `MujocoCfg` decides.
-
-    Fields about which entities disagree are left out, and reported by one `UserWarning`. Of sets of
-    switches (flags), only the switches are left out about which they disagree.
-    """
-    merged: dict[str, OptionRequest] = {}
-    conflicts: list[str] = []
-    names = dict.fromkeys(name for own in options.values() for name in own.values)
-    for name in (name for name in names if name not in _DECIDED):
-        wishes = {entity: own.values[name] for entity, own in options.items() if name in own.values}
-        if len(set(wishes.values())) == 1:
-            merged[name] = OptionRequest(next(iter(wishes.values())), tuple(wishes))
-        else:
-            wanted = ", ".join(f"{show(name, v)} ({entity})" for entity, v in wishes.items())
-            conflicts.append(f"  {name}: {wanted}")
-    for name in BIT_FIELDS:
-        _merge_switches(name, options, merged, conflicts)
-    if conflicts:
-        warnings.warn(
-            "Entities ask in their XML for different simulation options. A scene has one of each, "
-            "so these are not applied:\n" + "\n".join(conflicts) + "\nSet flags in MujocoCfg, and "
-            "the others in SceneCfg.spec_fn.",
-            UserWarning,
-            stacklevel=3,
-        )
-    return merged
-
-
-def _merge_switches(
-    name: str,
-    options: dict[str, EntityOptions],
-    merged: dict[str, OptionRequest],
-    conflicts: list[str],
-) -> None:
-    wishes = {e: own.switches[name] for e, own in options.items() if name in own.switches}
-    wanted = unwanted = 0
-    for bits, stated in wishes.values():
-        wanted |= bits
-        unwanted |= stated & ~bits
-    contested = wanted & unwanted
-    for entity, (bits, stated) in wishes.items():
-        if stated & contested:
-            yes, no = show(name, bits & contested), show(name, stated & ~bits & contested)
-            conflicts.append(f"  {name}: {entity} sets {yes} and clears {no}")
-    if wanted & ~contested:
-        entities = tuple(e for e, (bits, _) in wishes.items() if bits & ~contested)
-        merged[name] = OptionRequest(wanted & ~contested, entities)
-
-
-def write_requests(option: Any, requests: dict[str, OptionRequest]) -> None:
-    """Write requests onto the option block of the scene's spec."""
-    for name, request in requests.items():
-        write_option(option, name, request.value)
-        logger.info(
-            "Option %s = %s, as the XML of %s asks.",
-            name, show(name, request.value), ", ".join(request.entities),
-        )  # fmt: skip
-
-
-def drop_overridden(option: Any, requests: dict[str, OptionRequest]) -> dict[str, OptionRequest]:
-    """Return the requests that the scene's `spec_fn` left as they were; report the others."""
-    kept, changed = {}, []
-    for name, request in requests.items():
-        current = getattr(option, name)
-        if np.array_equal(current, request.value):
-            kept[name] = request
-        else:
-            changed.append(
-                f"  {name}: {show(name, current)}, not {show(name, request.value)} as "
-                f"{', '.join(request.entities)}"
-            )
-    if changed:
-        warnings.warn(
-            "SceneCfg.spec_fn sets options otherwise than the XML of an entity asks:\n"
-            + "\n".join(changed),
-            UserWarning,
-            stacklevel=3,
-        )
-    return kept
-
-
-def report_overruled(
-    cfg: MujocoCfg, stated: dict[str, EntityOptions], requests: dict[str, OptionRequest]
-) -> None:
-    """Log what `cfg` decides otherwise than XMLs state, one line each with the assignment to copy.
-
-    Flags that XMLs set in addition to those of `cfg` apply, and are logged too.
-
-    Args:
-        cfg: The options that are in force.
-        stated: Options by where they are stated, such as "the XML of 'robot'".
-        requests: Options of entities that are applied to the scene.
-    """
-    for source, options in stated.items():
-        for name, value in options.values.items():
-            if name in _DECIDED and not _same(getattr(cfg, name), _config_value(name, value)):
-                _report(source, name, getattr(cfg, name), _config_value(name, value))
-        for name in _FLAGS:
-            bits, known = options.switches.get(name, (0, 0))
-            current, cleared = tuple(getattr(cfg, name)), flag_names(name, known & ~bits)
-            kept = tuple(flag for flag in current if flag not in cleared)
-            if kept != current:
-                _report(source, name, current, kept)
-    for name in (name for name in _FLAGS if name in requests):
-        current = tuple(getattr(cfg, name))
-        added = tuple(
-            flag for flag in flag_names(name, requests[name].value) if flag not in current
-        )
-        if added:
-            sources = [f"the XML of {entity!r}" for entity in requests[name].entities]
-            adding = [
-                s
-                for s in sources
-                if set(flag_names(name, stated[s].switches[name][0])) & set(added)
-            ]
-            logger.warning(
-                "Option %s is %r, from MujocoCfg, plus %r, from %s, which applies to the whole "
-                "scene; to state it in the config, set sim.mujoco.%s = %r",
-                name, current, added, " and ".join(adding), name, current + added,
-            )  # fmt: skip
-
-
-def _report(source: str, name: str, current: Any, wanted: Any) -> None:
-    logger.warning(
-        "Option %s is %r, from MujocoCfg; to follow %s, set sim.mujoco.%s = %r",
-        name, current, source, name, wanted,
-    )  # fmt: skip
-
-
-def show(name: str, value: Any) -> str:
-    """Return an option's value as people write it."""
-    return str(flag_names(name, value) if name in _FLAGS else _config_value(name, value))
-
-
-def _config_value(name: str, value: Any) -> Any:
-    """Return MuJoCo's value of an option as `MujocoCfg` gives it."""
-    if name not in OPTION_ENUMS:
-        return tuple(value) if isinstance(value, np.ndarray) else value
-    enum, prefix = OPTION_ENUMS[name]
-    return enum(int(value)).name.removeprefix(prefix).lower()
-
-
-def _same(first: Any, second: Any) -> bool:
-    return bool(np.array_equal(np.asarray(first), np.asarray(second)))
-
-
-TERRAIN = "terrain"
+logger = logging.getLogger(__name__)
 
 
 @dataclass(kw_only=True)
@@ -271,8 +80,7 @@ class Scene:
             ValueError: the config makes no sense; entities or sensors cannot be built, or two
                 sensors have one name.
         """
-        if scene_cfg.num_envs < 1:
-            raise ValueError(f"SceneCfg.num_envs is {scene_cfg.num_envs}; it has to be at least 1.")
+        check_count("SceneCfg.num_envs", scene_cfg.num_envs)
         self._cfg = scene_cfg
         self._device = device
         self._spec = make_base_spec(scene_cfg.extent)
@@ -280,10 +88,12 @@ class Scene:
         self._entities: dict[str, Entity] = {}
         self._sensors: dict[str, Sensor[Any]] = {}
         self._sensor_context: SensorContext | None = None
-        self._add_terrain()
         self._add_entities()
-        self.entity_options = self._apply_entity_options()
+        self.entity_options = merge_entity_options(
+            {name: entity.options for name, entity in self._entities.items()}
+        )
         """Simulation options that entities ask for and nobody in the scene contradicts."""
+        write_requests(self._spec.option, self.entity_options)
         self._add_sensors()
         if scene_cfg.spec_fn is not None:
             scene_cfg.spec_fn(self._spec)
@@ -293,17 +103,14 @@ class Scene:
 
     # Composition.
 
-    def _add_terrain(self) -> None:
-        if self._cfg.terrain is None:
-            return
-        # A copy, because the user's config says what was asked for and stays as it is.
-        cfg = dataclasses.replace(
-            self._cfg.terrain, num_envs=self._cfg.num_envs, env_spacing=self._cfg.env_spacing
-        )
-        self._terrain = TerrainEntity(cfg, self._device)
-        self._attach(TERRAIN, self._terrain, prefix="")
-
     def _add_entities(self) -> None:
+        if self._cfg.terrain is not None:
+            # A copy, because the user's config says what was asked for and stays as it is.
+            terrain_cfg = dataclasses.replace(
+                self._cfg.terrain, num_envs=self._cfg.num_envs, env_spacing=self._cfg.env_spacing
+            )
+            self._terrain = TerrainEntity(terrain_cfg, self._device)
+            self._attach(TERRAIN, self._terrain, prefix="")
         for name, cfg in self._cfg.entities.items():
             if not name or "/" in name or name in self._entities:
                 raise ValueError(
@@ -318,20 +125,13 @@ class Scene:
 
     def _attach(self, name: str, entity: Entity, prefix: str) -> None:
         self._entities[name] = entity
-        entity.keep_spec_to_write()
+        entity.snapshot_spec()
         # MuJoCo would carry the entity's keyframe over, padded with the other entities' qpos0. The
         # scene's own holds the initial state of all.
         for key in list(entity.spec.keys):
             entity.spec.delete(key)
         make_asset_paths_absolute(entity.spec)
         attach(self._spec, entity.spec, prefix, self._spec.worldbody.add_frame())
-
-    def _apply_entity_options(self) -> dict[str, OptionRequest]:
-        requests = merge_entity_options(
-            {name: entity.options for name, entity in self._entities.items()}
-        )
-        write_requests(self._spec.option, requests)
-        return requests
 
     def _add_sensors(self) -> None:
         for cfg in self._cfg.sensors:
@@ -370,7 +170,7 @@ class Scene:
             return self._sensors[key]
         if key in self._entities:
             return self._entities[key]
-        raise KeyError(
+        raise UnknownNameError(
             f"The scene has no {key!r}. Entities: {list(self._entities)}. "
             f"Sensors: {list(self._sensors)}."
         )
@@ -546,3 +346,190 @@ class Scene:
         )
         path = Path(path)
         self.write(path.with_suffix("") if path.suffix == ".zip" else path, zip=True)
+
+
+def make_base_spec(extent: float | None) -> mujoco.MjSpec:
+    """Return a spec without elements or options, with mjlab's visual defaults.
+
+    `extent` is the size of the scene for viewers, in metres; None lets the compiler compute it.
+    """
+    spec = mujoco.MjSpec()
+    spec.modelname = "mjlab scene"
+    visual = spec.visual
+    visual.headlight.diffuse[:] = 0.6
+    visual.headlight.ambient[:] = 0.3
+    visual.headlight.specular[:] = 0.0
+    visual.rgba.force[:] = (1.0, 0.0, 0.0, 1.0)
+    visual.rgba.haze[:] = (0.15, 0.25, 0.35, 1.0)
+    visual.global_.azimuth = 135
+    visual.global_.elevation = -25
+    visual.global_.offwidth = 1920
+    visual.global_.offheight = 1080
+    visual.map.force = 0.005
+    visual.scale.forcewidth = 0.25
+    visual.scale.contactwidth = 0.4
+    visual.scale.contactheight = 0.15
+    visual.scale.framelength = 5.0
+    visual.scale.framewidth = 0.3
+    visual.quality.shadowsize = 8192
+    spec.stat.meansize = 0.03
+    if extent is not None:
+        spec.stat.extent = extent
+    return spec
+
+
+# Simulation options in the XML of entities.
+
+
+@dataclass(frozen=True)
+class OptionRequest:
+    """A value for a simulation option, and the entities that ask for it."""
+
+    value: Any
+    entities: tuple[str, ...]
+
+
+def merge_entity_options(options: dict[str, EntityOptions]) -> dict[str, OptionRequest]:
+    """Return what the entities ask for together, beyond what `MujocoCfg` decides.
+
+    Fields about which entities disagree are left out, and reported by one `UserWarning`. Of sets of
+    switches (flags), only the switches are left out about which they disagree.
+    """
+    merged: dict[str, OptionRequest] = {}
+    conflicts: list[str] = []
+    names = dict.fromkeys(name for own in options.values() for name in own.values)
+    for name in (name for name in names if name not in _DECIDED):
+        wishes = {entity: own.values[name] for entity, own in options.items() if name in own.values}
+        if len(set(wishes.values())) == 1:
+            merged[name] = OptionRequest(next(iter(wishes.values())), tuple(wishes))
+        else:
+            wanted = ", ".join(f"{show(name, v)} ({entity})" for entity, v in wishes.items())
+            conflicts.append(f"  {name}: {wanted}")
+    for name in BIT_FIELDS:
+        _merge_switches(name, options, merged, conflicts)
+    if conflicts:
+        warnings.warn(
+            "Entities ask in their XML for different simulation options. A scene has one of each, "
+            "so these are not applied:\n" + "\n".join(conflicts) + "\nSet flags in MujocoCfg, and "
+            "the others in SceneCfg.spec_fn.",
+            UserWarning,
+            stacklevel=3,
+        )
+    return merged
+
+
+def _merge_switches(
+    name: str,
+    options: dict[str, EntityOptions],
+    merged: dict[str, OptionRequest],
+    conflicts: list[str],
+) -> None:
+    wishes = {e: own.switches[name] for e, own in options.items() if name in own.switches}
+    wanted = unwanted = 0
+    for bits, stated in wishes.values():
+        wanted |= bits
+        unwanted |= stated & ~bits
+    contested = wanted & unwanted
+    for entity, (bits, stated) in wishes.items():
+        if stated & contested:
+            yes, no = show(name, bits & contested), show(name, stated & ~bits & contested)
+            conflicts.append(f"  {name}: {entity} sets {yes} and clears {no}")
+    if wanted & ~contested:
+        entities = tuple(e for e, (bits, _) in wishes.items() if bits & ~contested)
+        merged[name] = OptionRequest(wanted & ~contested, entities)
+
+
+def write_requests(option: Any, requests: dict[str, OptionRequest]) -> None:
+    """Write requests onto the option block of the scene's spec."""
+    for name, request in requests.items():
+        write_option(option, name, request.value)
+        logger.info(
+            "Option %s = %s, as the XML of %s asks.",
+            name, show(name, request.value), ", ".join(request.entities),
+        )  # fmt: skip
+
+
+def drop_overridden(option: Any, requests: dict[str, OptionRequest]) -> dict[str, OptionRequest]:
+    """Return the requests that the scene's `spec_fn` left as they were; report the others."""
+    kept, changed = {}, []
+    for name, request in requests.items():
+        current = getattr(option, name)
+        if np.array_equal(current, request.value):
+            kept[name] = request
+        else:
+            changed.append(
+                f"  {name}: {show(name, current)}, not {show(name, request.value)} as "
+                f"{', '.join(request.entities)}"
+            )
+    if changed:
+        warnings.warn(
+            "SceneCfg.spec_fn sets options otherwise than the XML of an entity asks:\n"
+            + "\n".join(changed),
+            UserWarning,
+            stacklevel=3,
+        )
+    return kept
+
+
+def report_overruled(
+    cfg: MujocoCfg, stated: dict[str, EntityOptions], requests: dict[str, OptionRequest]
+) -> None:
+    """Log what `cfg` decides otherwise than XMLs state, one line each with the assignment to copy.
+
+    Flags that XMLs set in addition to those of `cfg` apply, and are logged too.
+
+    Args:
+        cfg: The options that are in force.
+        stated: Options by where they are stated, such as "the XML of 'robot'".
+        requests: Options of entities that are applied to the scene.
+    """
+    for source, options in stated.items():
+        for name, value in options.values.items():
+            if name not in _DECIDED:
+                continue
+            current, wanted = getattr(cfg, name), _config_value(name, value)
+            if not np.array_equal(np.asarray(current), np.asarray(wanted)):
+                _report(source, name, current, wanted)
+        for name in _FLAGS:
+            bits, known = options.switches.get(name, (0, 0))
+            current, cleared = tuple(getattr(cfg, name)), flag_names(name, known & ~bits)
+            kept = tuple(flag for flag in current if flag not in cleared)
+            if kept != current:
+                _report(source, name, current, kept)
+    for name in (name for name in _FLAGS if name in requests):
+        current = tuple(getattr(cfg, name))
+        added = tuple(
+            flag for flag in flag_names(name, requests[name].value) if flag not in current
+        )
+        if added:
+            sources = [f"the XML of {entity!r}" for entity in requests[name].entities]
+            adding = [
+                s
+                for s in sources
+                if set(flag_names(name, stated[s].switches[name][0])) & set(added)
+            ]
+            logger.warning(
+                "Option %s is %r, from MujocoCfg, plus %r, from %s, which applies to the whole "
+                "scene; to state it in the config, set sim.mujoco.%s = %r",
+                name, current, added, " and ".join(adding), name, current + added,
+            )  # fmt: skip
+
+
+def _report(source: str, name: str, current: Any, wanted: Any) -> None:
+    logger.warning(
+        "Option %s is %r, from MujocoCfg; to follow %s, set sim.mujoco.%s = %r",
+        name, current, source, name, wanted,
+    )  # fmt: skip
+
+
+def show(name: str, value: Any) -> str:
+    """Return an option's value as people write it."""
+    return str(flag_names(name, value) if name in _FLAGS else _config_value(name, value))
+
+
+def _config_value(name: str, value: Any) -> Any:
+    """Return MuJoCo's value of an option as `MujocoCfg` gives it."""
+    if name not in OPTION_ENUMS:
+        return tuple(value) if isinstance(value, np.ndarray) else value
+    enum, prefix = OPTION_ENUMS[name]
+    return enum(int(value)).name.removeprefix(prefix).lower()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
-from mjlab.managers.null_managers import NullManager
+from mjlab.managers.manager_base import NullManager
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.devices import resolve_device
 from mjlab.scripts.environments import make_env

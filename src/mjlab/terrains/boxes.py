@@ -165,16 +165,12 @@ def merge_equal_cells(
         if not free[i, j]:
             continue
         same = free & (values == values[i, j])
-        num_i = _run(same[i : i + longest, j])
+        # `argmin` finds the first cell that is not equal; appended, there is always one.
+        num_i = int(np.argmin(np.append(same[i : i + longest, j], False)))
         block = same[i : i + num_i, j : j + longest].all(axis=0)
-        num_j = _run(block)
+        num_j = int(np.argmin(np.append(block, False)))
         free[i : i + num_i, j : j + num_j] = False
         yield i, j, num_i, num_j
-
-
-def _run(flags: np.ndarray) -> int:
-    """Return how many of the first flags are set."""
-    return len(flags) if flags.all() else int(np.argmin(flags))
 
 
 def frame_color(base: tuple[float, float, float]) -> RGBA:

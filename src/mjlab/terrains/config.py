@@ -26,6 +26,8 @@ from mjlab.terrains.primitive_terrains import (
     BoxTiltedGridTerrainCfg,
 )
 from mjlab.terrains.terrain_generator import SubTerrainCfg, TerrainGeneratorCfg
+from mjlab.utils.errors import UnknownNameError
+from mjlab.utils.string import suggest
 
 _F = TypeVar("_F", bound=Callable[..., SubTerrainCfg])
 
@@ -34,7 +36,7 @@ class _Presets(dict[str, Callable[..., SubTerrainCfg]]):
     """Presets by name."""
 
     def __missing__(self, name: str) -> NoReturn:
-        raise KeyError(f"There is no terrain preset {name!r}. There are: {', '.join(self)}.")
+        raise UnknownNameError(f"Unknown terrain preset {name!r}; {suggest(name, self)}")
 
 
 ALL_TERRAIN_PRESETS: dict[str, Callable[..., SubTerrainCfg]] = _Presets()

@@ -98,11 +98,15 @@ class NanGuard:
         self.dump_path: Path | None = None
         self._steps = 0
         self._dumped = False
+        mocap = _MOCAP_STATE if mj_model.nmocap else ()
+        sizes = {"act": mj_model.na, "history": mj_model.nhistory}
+        self._state_fields = [n for n in (*_PHYSICS_STATE, *mocap) if sizes.get(n, 1)]
+        self._input_fields = [n for n in _INPUTS if n != "ctrl" or mj_model.nu]
 
     def capture(self, wp_data: Any) -> None:
         """Remember the present state of all environments; call before a substep."""
         if self.enabled and not self._dumped:
-            names = (*self._state_fields(), *self._input_fields())
+            names = (*self._state_fields, *self._input_fields)
             self.buffer.append({name: getattr(wp_data, name).clone() for name in names})
             self._steps += 1
 
@@ -161,14 +165,6 @@ class NanGuard:
             raise ValueError("detect_nans needs at least one field to check.")
         return invalid
 
-    def _state_fields(self) -> list[str]:
-        mocap = _MOCAP_STATE if self.mj_model.nmocap else ()
-        sizes = {"act": self.mj_model.na, "history": self.mj_model.nhistory}
-        return [name for name in (*_PHYSICS_STATE, *mocap) if sizes.get(name, 1)]
-
-    def _input_fields(self) -> list[str]:
-        return [name for name in _INPUTS if name != "ctrl" or self.mj_model.nu]
-
     def _dump(self, nan_ids: list[int]) -> Path:
         import mujoco
         import numpy as np
@@ -206,10 +202,10 @@ class NanGuard:
         for step, kept in enumerate(self.buffer, start=first):
             rows = [
                 kept[name][ids].flatten(1).cpu().numpy().astype(np.float64)
-                for name in self._state_fields()
+                for name in self._state_fields
             ]
             arrays[f"states_step_{step:06d}"] = np.concatenate(rows, axis=1)
-            for name in self._input_fields():
+            for name in self._input_fields:
                 arrays[f"{name}_step_{step:06d}"] = kept[name][ids].cpu().numpy()
         return arrays
 

@@ -132,22 +132,14 @@ def available_cores() -> int:
         cores = len(os.sched_getaffinity(0))
     else:
         cores = os.cpu_count() or 1
-    quota = _cpu_quota()
-    return cores if quota is None else max(1, min(cores, math.ceil(quota)))
-
-
-def _cpu_quota() -> float | None:
-    """Return the CPU quota of this process's control group (cores), None if unlimited.
-
-    The limits of all groups above it apply as well.
-    """
+    # Quotas of this process's control group and of all groups above it apply together.
     quotas = [
         quota
         for folder, read in _control_groups()
         for group in (folder, *folder.parents)
         if group.is_relative_to(_CGROUP_ROOT) and (quota := read(group)) is not None
     ]
-    return min(quotas, default=None)
+    return max(1, min(cores, math.ceil(min(quotas, default=cores))))
 
 
 def _control_groups() -> Iterator[tuple[Path, Callable[[Path], float | None]]]:

@@ -1,4 +1,9 @@
-"""The loop all interactive viewers share: pacing, pausing, actions and errors."""
+"""The loop all interactive viewers share: pacing, pausing, actions and errors.
+
+`BaseViewer` is the loop; `run_headless` is the one without a display. What they expect of environments
+and policies is above them; the clock (`RealtimePacer`, `RateMeter`) and the recent values of terms
+(`TermHistory`) are below.
+"""
 
 from __future__ import annotations
 
@@ -20,118 +25,22 @@ import numpy as np
 import torch
 
 from mjlab.compat import older_names
+from mjlab.utils.errors import check_count, check_positive
 from mjlab.utils.signals import first_interrupt_calls
 
 if TYPE_CHECKING:
-    import torch
-
     from mjlab.envs import ManagerBasedRlEnvCfg
 
-
-# MERGED mjlab.viewer.base: When to step and when to draw, so that the simulation keeps to real time.
+log = logging.getLogger(__name__)
 
 SPEEDS = tuple(2.0**exponent for exponent in range(-5, 4))
 """Speeds a viewer offers, as multiples of real time: 1/32, 1/16, ... 8."""
+
+# Longest sleep between two looks at what is due, so that buttons answer at once.
+_MAX_SLEEP_S = 0.005
+_MIN_SLEEP_S = 0.0005
+
 _STATS_WINDOW_S = 0.5
-
-
-def speed_label(multiplier: float) -> str:
-    """A speed as people write it: `1/4x`, `1x`, `8x`."""
-    if multiplier < 1.0:
-        return f"1/{round(1.0 / multiplier)}x"
-    return f"{multiplier:g}x"
-
-
-class RealtimePacer:
-    """Turns elapsed wall time into a budget of simulated time to step through.
-
-    Time that could not be used within one frame is dropped except for a single step: a simulation
-    that is slower than asked for runs late, and the screen still answers.
-    """
-
-    def __init__(self, step_dt: float, frame_period: float, speeds: Sequence[float] = SPEEDS):
-        self.step_dt = step_dt
-        self.frame_period = frame_period
-        self.capped = False
-        self._speeds = tuple(speeds)
-        self._budget = 0.0
-        self.reset_speed()
-
-    @property
-    def speed(self) -> float:
-        """Target speed as a multiple of real time."""
-        return self._speeds[self._speed_index]
-
-    def change_speed(self, steps: int) -> None:
-        """Go `steps` up (or down, where negative) in the list of speeds, within its ends."""
-        self._speed_index = min(max(self._speed_index + steps, 0), len(self._speeds) - 1)
-
-    def reset_speed(self) -> None:
-        """Select real time, or the speed nearest to it."""
-        ratios = [abs(math.log(speed)) for speed in self._speeds]
-        self._speed_index = ratios.index(min(ratios))
-
-    def add(self, elapsed: float) -> None:
-        """Add `elapsed` seconds of wall time to the budget."""
-        self._budget += elapsed * self.speed
-
-    def take_step(self) -> bool:
-        """Whether there is time for one more step; it is taken off the budget."""
-        # Adding many small times leaves rounding errors, which must not cost a whole step.
-        if self._budget < self.step_dt * (1.0 - 1e-9):
-            return False
-        self._budget = max(self._budget - self.step_dt, 0.0)
-        return True
-
-    @property
-    def time_to_next_step(self) -> float:
-        """Wall time in seconds until the budget is enough for a step."""
-        return max(self.step_dt - self._budget, 0.0) / self.speed
-
-    def out_of_time(self) -> None:
-        """Say that this frame's wall time is used up; what is left is cut to one step."""
-        self.capped = self._budget >= self.step_dt
-        self._budget = min(self._budget, self.step_dt)
-
-    def clear(self) -> None:
-        """Forget the budget: time that passed while paused is not caught up with."""
-        self._budget = 0.0
-        self.capped = False
-
-
-class RateMeter:
-    """Steps and frames a second, averaged over half a second of wall time."""
-
-    def __init__(self, now: float):
-        self.steps_per_second = 0.0
-        self.frames_per_second = 0.0
-        self._start = now
-        self._steps = 0
-        self._frames = 0
-
-    def count(self, steps: int = 0, frames: int = 0) -> None:
-        self._steps += steps
-        self._frames += frames
-
-    def update(self, now: float) -> bool:
-        """Close the averaging window if it is full; return whether there are new rates."""
-        elapsed = now - self._start
-        if elapsed < _STATS_WINDOW_S:
-            return False
-        self.steps_per_second = self._steps / elapsed
-        self.frames_per_second = self._frames / elapsed
-        self._start = now
-        self._steps = self._frames = 0
-        return True
-
-    def restart(self, now: float) -> None:
-        """Forget what was counted, as after a pause."""
-        self._start = now
-        self._steps = self._frames = 0
-        self.steps_per_second = self.frames_per_second = 0.0
-
-
-# MERGED mjlab.viewer.base: What viewers, environments and policies expect of each other.
 
 
 class VerbosityLevel(enum.IntEnum):
@@ -176,23 +85,6 @@ class PolicyProtocol(Protocol):
     def __call__(self, obs: torch.Tensor) -> torch.Tensor: ...
 
 
-def ended(results: tuple[Any, ...]) -> torch.Tensor:
-    """Return where an episode ended (num_envs,), from the four or five results of a step."""
-    return results[2] if len(results) == 4 else results[2] | results[3]
-
-
-def forget(policy: Any, dones: torch.Tensor) -> None:
-    """Let a policy with memory forget the environments in which `dones` (num_envs,) is not 0."""
-    reset = getattr(policy, "reset", None)
-    try:
-        knows_ends = callable(reset) and "dones" in inspect.signature(reset).parameters
-    except (TypeError, ValueError):
-        # Compiled functions do not say what they take.
-        return
-    if knows_ends:
-        reset(dones)
-
-
 class ViewerAction(enum.Enum):
     """What a person can ask a viewer for."""
 
@@ -231,102 +123,6 @@ class ViewerStatus:
     """Last line of the error that paused the viewer."""
 
 
-# MERGED mjlab.viewer.base: Recent values of named terms, one point for every environment step.
-
-
-class TermHistory:
-    """Keeps the last `length` values of each term of a manager, for one environment."""
-
-    def __init__(self, length: int):
-        self.length = length
-        self._values: dict[str, deque[float]] = {}
-
-    @property
-    def names(self) -> list[str]:
-        return list(self._values)
-
-    def add(self, terms: Iterable[tuple[str, Sequence[float]]]) -> None:
-        """Append one point a term, as `get_active_iterable_terms(env_idx)` gives them.
-
-        A value that is not finite is recorded as NaN, which plots leave out.
-        """
-        for name, values in terms:
-            value = float(np.ravel(values)[0])
-            series = self._values.setdefault(name, deque(maxlen=self.length))
-            series.append(value if np.isfinite(value) else float("nan"))
-
-    def values(self, name: str) -> np.ndarray:
-        """Points of one term, (count,), the latest last."""
-        return np.array(self._values.get(name, ()), dtype=float)
-
-    def mean(self, name: str) -> float:
-        """Mean of the finite points; 0 without any."""
-        values = self.values(name)
-        finite = values[np.isfinite(values)]
-        return float(finite.mean()) if len(finite) else 0.0
-
-    def clear(self) -> None:
-        """Forget the points, keep the names."""
-        for series in self._values.values():
-            series.clear()
-
-
-# MERGED mjlab.viewer.base: Playing a policy without looking at it.
-
-
-@dataclass(frozen=True)
-class HeadlessResult:
-    """What happened in `run_headless`."""
-
-    num_steps: int
-    """Environment steps taken."""
-    mean_step_reward: float
-    """Reward a step, averaged over steps and environments."""
-    num_episodes: int
-    """Episodes that ended, over all environments."""
-
-
-def run_headless(
-    env: EnvProtocol,
-    policy: PolicyProtocol,
-    num_steps: int,
-    on_step: Callable[[int], None] | None = None,
-) -> HeadlessResult:
-    """Step `env` with `policy` as fast as it goes.
-
-    Args:
-        env: An environment, or the vector wrapper rsl_rl uses; its `step` returns four or five
-            things, of which the second is the reward (num_envs,).
-        policy: Maps observations to actions (num_envs, num_actions).
-        num_steps: Environment steps to take.
-        on_step: Called with the number of steps done, after each.
-
-    Raises:
-        ValueError: The number of steps is negative.
-    """
-    if num_steps < 0:
-        raise ValueError(f"num_steps is {num_steps}; it must be 0 or more.")
-    reward_sum = torch.zeros((), device=env.device, dtype=torch.float64)
-    episodes = torch.zeros((), device=env.device, dtype=torch.int64)
-    with torch.no_grad():
-        for step in range(num_steps):
-            result = env.step(policy(env.get_observations()))
-            reward_sum += result[1].double().mean()
-            done = ended(result)
-            forget(policy, done)
-            episodes += (done != 0).sum()
-            if on_step is not None:
-                on_step(step + 1)
-    return HeadlessResult(num_steps, float(reward_sum) / max(num_steps, 1), int(episodes))
-
-
-log = logging.getLogger(__name__)
-
-# Longest sleep between two looks at what is due, so that buttons answer at once.
-_MAX_SLEEP_S = 0.005
-_MIN_SLEEP_S = 0.0005
-
-
 class BaseViewer(ABC):
     """Steps an environment with a policy in real time, and lets a subclass show it.
 
@@ -355,8 +151,7 @@ class BaseViewer(ABC):
         Raises:
             ValueError: The frame rate is not positive.
         """
-        if frame_rate <= 0:
-            raise ValueError(f"frame_rate is {frame_rate}; it must be positive.")
+        check_positive("frame_rate", frame_rate)
         self.env = env
         self.policy = policy
         self.frame_rate = frame_rate
@@ -424,14 +219,21 @@ class BaseViewer(ABC):
         """
         self._interrupted = False
         self._step_limit = None if num_steps is None else self._total_steps + num_steps
-        with first_interrupt_calls(self._interrupt, enabled=catch_sigint):
+
+        def interrupt() -> None:
+            self._interrupted = True
+
+        with first_interrupt_calls(interrupt, enabled=catch_sigint):
             try:
                 self.setup()
                 self._last_tick = self._next_frame = time.perf_counter()
                 self._rates.restart(self._last_tick)
                 while self.is_running() and not self._should_stop():
                     if not self.tick():
-                        time.sleep(self._time_until_due())
+                        due = self._next_frame - time.perf_counter()
+                        if not self._paused:
+                            due = min(due, self._pacer.time_to_next_step)
+                        time.sleep(min(max(due, _MIN_SLEEP_S), _MAX_SLEEP_S))
             finally:
                 self.close()
 
@@ -444,7 +246,15 @@ class BaseViewer(ABC):
             self._pacer.add(elapsed)
             self._step_within_budget()
         self._update_stats()
-        return self._show_frame_if_due()
+        now = time.perf_counter()
+        if now < self._next_frame:
+            return False
+        # A frame that came late does not make the next ones come early.
+        self._next_frame = max(self._next_frame + self.frame_time, now)
+        with self._pause_on_error("updating the viewer"):
+            self.sync_env_to_viewer()
+        self._rates.count(frames=1)
+        return True
 
     def step_simulation(self) -> bool:
         """Observe, ask the policy, step once. False if that failed, which pauses the viewer."""
@@ -470,9 +280,6 @@ class BaseViewer(ABC):
     def _should_stop(self) -> bool:
         return self._interrupted or self._limit_reached()
 
-    def _interrupt(self) -> None:
-        self._interrupted = True
-
     def _step_within_budget(self) -> None:
         self._pacer.capped = False
         deadline = time.perf_counter() + self.frame_time
@@ -482,24 +289,6 @@ class BaseViewer(ABC):
             if time.perf_counter() >= deadline:
                 self._pacer.out_of_time()
                 return
-
-    def _time_until_due(self) -> float:
-        """Seconds until the next step or frame, within the bounds of a sleep."""
-        due = self._next_frame - time.perf_counter()
-        if not self._paused:
-            due = min(due, self._pacer.time_to_next_step)
-        return min(max(due, _MIN_SLEEP_S), _MAX_SLEEP_S)
-
-    def _show_frame_if_due(self) -> bool:
-        now = time.perf_counter()
-        if now < self._next_frame:
-            return False
-        # A frame that came late does not make the next ones come early.
-        self._next_frame = max(self._next_frame + self.frame_time, now)
-        with self._pause_on_error("updating the viewer"):
-            self.sync_env_to_viewer()
-        self._rates.count(frames=1)
-        return True
 
     # Actions.
 
@@ -533,16 +322,7 @@ class BaseViewer(ABC):
         self.request_action("reset_speed")
 
     def _process_actions(self) -> None:
-        while True:
-            try:
-                action, payload = self._actions.get_nowait()
-            except queue.Empty:
-                return
-            with self._pause_on_error(f"performing the action {action.value!r}"):
-                self._perform(action, payload)
-
-    def _perform(self, action: ViewerAction, payload: Any) -> None:
-        known: dict[ViewerAction, Callable[[], Any]] = {
+        performs: dict[ViewerAction, Callable[[], Any]] = {
             ViewerAction.RESET: self.reset_environment,
             ViewerAction.TOGGLE_PAUSE: self.toggle_pause,
             ViewerAction.SINGLE_STEP: self._single_step,
@@ -550,10 +330,18 @@ class BaseViewer(ABC):
             ViewerAction.SPEED_DOWN: self.decrease_speed,
             ViewerAction.RESET_SPEED: self.reset_speed,
         }
-        if action in known:
-            known[action]()
-        elif not self.handle_action(action, payload):
-            self.log(f"This viewer does not know the action {action.value!r} ({payload!r}).")
+        while True:
+            try:
+                action, payload = self._actions.get_nowait()
+            except queue.Empty:
+                return
+            with self._pause_on_error(f"performing the action {action.value!r}"):
+                if action in performs:
+                    performs[action]()
+                elif not self.handle_action(action, payload):
+                    self.log(
+                        f"This viewer does not know the action {action.value!r} ({payload!r})."
+                    )
 
     def _single_step(self) -> None:
         if self._paused and not self._limit_reached():
@@ -654,6 +442,201 @@ class BaseViewer(ABC):
                 log.exception("The viewer is paused after an error while %s.", doing)
             self.pause()
             self._last_error = last_line
+
+
+@dataclass(frozen=True)
+class HeadlessResult:
+    """What happened in `run_headless`."""
+
+    num_steps: int
+    """Environment steps taken."""
+    mean_step_reward: float
+    """Reward a step, averaged over steps and environments."""
+    num_episodes: int
+    """Episodes that ended, over all environments."""
+
+
+def run_headless(
+    env: EnvProtocol,
+    policy: PolicyProtocol,
+    num_steps: int,
+    on_step: Callable[[int], None] | None = None,
+) -> HeadlessResult:
+    """Step `env` with `policy` as fast as it goes.
+
+    Args:
+        env: An environment, or the vector wrapper rsl_rl uses; its `step` returns four or five
+            things, of which the second is the reward (num_envs,).
+        policy: Maps observations to actions (num_envs, num_actions).
+        num_steps: Environment steps to take.
+        on_step: Called with the number of steps done, after each.
+
+    Raises:
+        ValueError: The number of steps is negative.
+    """
+    check_count("num_steps", num_steps, minimum=0)
+    reward_sum = torch.zeros((), device=env.device, dtype=torch.float64)
+    episodes = torch.zeros((), device=env.device, dtype=torch.int64)
+    with torch.no_grad():
+        for step in range(num_steps):
+            result = env.step(policy(env.get_observations()))
+            reward_sum += result[1].double().mean()
+            done = ended(result)
+            forget(policy, done)
+            episodes += (done != 0).sum()
+            if on_step is not None:
+                on_step(step + 1)
+    return HeadlessResult(num_steps, float(reward_sum) / max(num_steps, 1), int(episodes))
+
+
+def ended(results: tuple[Any, ...]) -> torch.Tensor:
+    """Return where an episode ended (num_envs,), from the four or five results of a step."""
+    return results[2] if len(results) == 4 else results[2] | results[3]
+
+
+def forget(policy: Any, dones: torch.Tensor) -> None:
+    """Let a policy with memory forget the environments in which `dones` (num_envs,) is not 0."""
+    reset = getattr(policy, "reset", None)
+    try:
+        knows_ends = callable(reset) and "dones" in inspect.signature(reset).parameters
+    except (TypeError, ValueError):
+        # Compiled functions do not say what they take.
+        return
+    if knows_ends:
+        reset(dones)
+
+
+def speed_label(multiplier: float) -> str:
+    """A speed as people write it: `1/4x`, `1x`, `8x`."""
+    if multiplier < 1.0:
+        return f"1/{round(1.0 / multiplier)}x"
+    return f"{multiplier:g}x"
+
+
+class RealtimePacer:
+    """Turns elapsed wall time into a budget of simulated time to step through.
+
+    Time that could not be used within one frame is dropped except for a single step: a simulation
+    that is slower than asked for runs late, and the screen still answers.
+    """
+
+    def __init__(self, step_dt: float, frame_period: float, speeds: Sequence[float] = SPEEDS):
+        self.step_dt = step_dt
+        self.frame_period = frame_period
+        self.capped = False
+        self._speeds = tuple(speeds)
+        self._budget = 0.0
+        self.reset_speed()
+
+    @property
+    def speed(self) -> float:
+        """Target speed as a multiple of real time."""
+        return self._speeds[self._speed_index]
+
+    def change_speed(self, steps: int) -> None:
+        """Go `steps` up (or down, where negative) in the list of speeds, within its ends."""
+        self._speed_index = min(max(self._speed_index + steps, 0), len(self._speeds) - 1)
+
+    def reset_speed(self) -> None:
+        """Select real time, or the speed nearest to it."""
+        ratios = [abs(math.log(speed)) for speed in self._speeds]
+        self._speed_index = ratios.index(min(ratios))
+
+    def add(self, elapsed: float) -> None:
+        """Add `elapsed` seconds of wall time to the budget."""
+        self._budget += elapsed * self.speed
+
+    def take_step(self) -> bool:
+        """Whether there is time for one more step; it is taken off the budget."""
+        # Adding many small times leaves rounding errors, which must not cost a whole step.
+        if self._budget < self.step_dt * (1.0 - 1e-9):
+            return False
+        self._budget = max(self._budget - self.step_dt, 0.0)
+        return True
+
+    @property
+    def time_to_next_step(self) -> float:
+        """Wall time in seconds until the budget is enough for a step."""
+        return max(self.step_dt - self._budget, 0.0) / self.speed
+
+    def out_of_time(self) -> None:
+        """Say that this frame's wall time is used up; what is left is cut to one step."""
+        self.capped = self._budget >= self.step_dt
+        self._budget = min(self._budget, self.step_dt)
+
+    def clear(self) -> None:
+        """Forget the budget: time that passed while paused is not caught up with."""
+        self._budget = 0.0
+        self.capped = False
+
+
+class RateMeter:
+    """Steps and frames a second, averaged over half a second of wall time."""
+
+    def __init__(self, now: float):
+        self.steps_per_second = 0.0
+        self.frames_per_second = 0.0
+        self._start = now
+        self._steps = 0
+        self._frames = 0
+
+    def count(self, steps: int = 0, frames: int = 0) -> None:
+        self._steps += steps
+        self._frames += frames
+
+    def update(self, now: float) -> bool:
+        """Close the averaging window if it is full; return whether there are new rates."""
+        elapsed = now - self._start
+        if elapsed < _STATS_WINDOW_S:
+            return False
+        self.steps_per_second = self._steps / elapsed
+        self.frames_per_second = self._frames / elapsed
+        self._start = now
+        self._steps = self._frames = 0
+        return True
+
+    def restart(self, now: float) -> None:
+        """Forget what was counted, as after a pause."""
+        self._start = now
+        self._steps = self._frames = 0
+        self.steps_per_second = self.frames_per_second = 0.0
+
+
+class TermHistory:
+    """Keeps the last `length` values of each term of a manager, for one environment."""
+
+    def __init__(self, length: int):
+        self.length = length
+        self._values: dict[str, deque[float]] = {}
+
+    @property
+    def names(self) -> list[str]:
+        return list(self._values)
+
+    def add(self, terms: Iterable[tuple[str, Sequence[float]]]) -> None:
+        """Append one point a term, as `get_active_iterable_terms(env_idx)` gives them.
+
+        A value that is not finite is recorded as NaN, which plots leave out.
+        """
+        for name, values in terms:
+            value = float(np.ravel(values)[0])
+            series = self._values.setdefault(name, deque(maxlen=self.length))
+            series.append(value if np.isfinite(value) else float("nan"))
+
+    def values(self, name: str) -> np.ndarray:
+        """Points of one term, (count,), the latest last."""
+        return np.array(self._values.get(name, ()), dtype=float)
+
+    def mean(self, name: str) -> float:
+        """Mean of the finite points; 0 without any."""
+        values = self.values(name)
+        finite = values[np.isfinite(values)]
+        return float(finite.mean()) if len(finite) else 0.0
+
+    def clear(self) -> None:
+        """Forget the points, keep the names."""
+        for series in self._values.values():
+            series.clear()
 
 
 __getattr__ = older_names(__name__)

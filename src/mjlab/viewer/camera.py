@@ -9,6 +9,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjlab.utils.errors import check_exists
+from mjlab.utils.string import suggest
 from mjlab.viewer.viewer_config import OriginType, ViewerConfig
 
 
@@ -60,7 +62,7 @@ def resolve_camera(
         ValueError: The camera, entity or body does not exist, or is needed and was not named.
     """
     if cfg.camera is not None:
-        return _view_of_model_camera(cfg, model)
+        return _view_of_model_camera(model, cfg.camera, cfg.distance)
     return CameraView(
         body_id=_followed_body(cfg, model, entities),
         lookat=cfg.lookat,
@@ -68,28 +70,6 @@ def resolve_camera(
         azimuth=cfg.azimuth,
         elevation=cfg.elevation,
         fovy=cfg.fovy,
-    )
-
-
-def _view_of_model_camera(cfg: ViewerConfig, model: mujoco.MjModel) -> CameraView:
-    """Return the view of the camera `cfg.camera`, as it stands in the model's initial pose."""
-    names = [model.camera(i).name for i in range(model.ncam)]
-    if cfg.camera not in names:
-        raise ValueError(
-            f"The viewer's camera {cfg.camera!r} is not in the scene. Cameras there: {names}."
-        )
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    camera_id = names.index(cfg.camera)
-    # A MuJoCo camera looks along its own -z axis.
-    forward = -data.cam_xmat[camera_id].reshape(3, 3)[:, 2]
-    return CameraView(
-        body_id=None,
-        lookat=tuple(data.cam_xpos[camera_id] + cfg.distance * forward),
-        distance=cfg.distance,
-        azimuth=float(np.rad2deg(np.arctan2(forward[1], forward[0]))),
-        elevation=float(np.rad2deg(np.arcsin(np.clip(forward[2], -1.0, 1.0)))),
-        fovy=float(model.cam_fovy[camera_id]),
     )
 
 
@@ -123,6 +103,25 @@ def nearest_envs(origins: np.ndarray, env_idx: int, count: int) -> list[int]:
     return [int(i) for i in order[: min(count, len(origins) - 1)]]
 
 
+def _view_of_model_camera(model: mujoco.MjModel, name: str, distance: float) -> CameraView:
+    """Return the view of the camera `name`, as it stands in the model's initial pose."""
+    names = [model.camera(i).name for i in range(model.ncam)]
+    check_exists("viewer.camera", name, names)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    camera_id = names.index(name)
+    # A MuJoCo camera looks along its own -z axis.
+    forward = -data.cam_xmat[camera_id].reshape(3, 3)[:, 2]
+    return CameraView(
+        body_id=None,
+        lookat=tuple(data.cam_xpos[camera_id] + distance * forward),
+        distance=distance,
+        azimuth=float(np.rad2deg(np.arctan2(forward[1], forward[0]))),
+        elevation=float(np.rad2deg(np.arcsin(np.clip(forward[2], -1.0, 1.0)))),
+        fovy=float(model.cam_fovy[camera_id]),
+    )
+
+
 def _followed_body(
     cfg: ViewerConfig, model: mujoco.MjModel, entities: Mapping[str, Any]
 ) -> int | None:
@@ -130,42 +129,26 @@ def _followed_body(
         return None
     if cfg.origin_type is OriginType.AUTO:
         return first_moving_body(model)
-    name = _entity_name(cfg, entities)
+    names = [name for name in entities if name != "terrain"]
+    if cfg.entity_name is None and len(names) != 1:
+        raise ValueError(
+            f"viewer.entity_name: origin_type {cfg.origin_type.name} needs the name of an entity, "
+            f"because the scene has {len(names)}; use one of {names}."
+        )
+    name = names[0] if cfg.entity_name is None else cfg.entity_name
+    check_exists("viewer.entity_name", name, entities)
     if cfg.origin_type is OriginType.ASSET_ROOT:
         return int(entities[name].indexing.root_body_id)
-    return _body_of_entity(cfg, model, entities, name)
-
-
-def _entity_name(cfg: ViewerConfig, entities: Mapping[str, Any]) -> str:
-    names = [name for name in entities if name != "terrain"]
-    if cfg.entity_name is None:
-        if len(names) == 1:
-            return names[0]
-        raise ValueError(
-            f"The viewer's origin_type {cfg.origin_type.name} needs entity_name, because the scene "
-            f"has {len(names)} entities: {names}. Set viewer.entity_name to one of them."
-        )
-    if cfg.entity_name not in entities:
-        raise ValueError(
-            f"The viewer's entity_name {cfg.entity_name!r} is not in the scene. "
-            f"Entities there: {names}."
-        )
-    return cfg.entity_name
-
-
-def _body_of_entity(
-    cfg: ViewerConfig, model: mujoco.MjModel, entities: Mapping[str, Any], entity_name: str
-) -> int:
-    candidates = list(entities[entity_name].body_names)
+    bodies = list(entities[name].body_names)
     if cfg.body_name is None:
         raise ValueError(
-            "The viewer's origin_type ASSET_BODY needs body_name. "
-            f"Bodies of {entity_name!r}: {candidates}."
+            f"viewer.body_name: origin_type {cfg.origin_type.name} needs the name of a body of "
+            f"{name!r}; use one of {bodies}."
         )
-    body_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"{entity_name}/{cfg.body_name}")
+    body_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"{name}/{cfg.body_name}")
     if body_id < 0:
         raise ValueError(
-            f"The viewer's body_name {cfg.body_name!r} is not a body of entity {entity_name!r}. "
-            f"Bodies there: {candidates}."
+            f"Unknown viewer.body_name {cfg.body_name!r} of entity {name!r}; "
+            f"{suggest(cfg.body_name, bodies)}"
         )
     return int(body_id)

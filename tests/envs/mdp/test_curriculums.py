@@ -65,8 +65,8 @@ def test_terminations_have_stages_too() -> None:
     [
         ([{"step": 5}, {"step": 4}], ValueError, "4 comes after 5"),
         ([{"weight": 1.0}], ValueError, "no 'step'"),
-        ([{"step": 0, "wieght": 1.0}], AttributeError, r"no fields \['wieght'\].*weight"),
-        ([{"step": 0, "params": {"sdt": 1.0}}], KeyError, r"no parameters \['sdt'\].*std"),
+        ([{"step": 0, "wieght": 1.0}], AttributeError, r"'wieght'.*'weight'"),
+        ([{"step": 0, "params": {"sdt": 1.0}}], KeyError, r"'sdt'.*'std'"),
     ],
 )
 def test_mistakes_are_found_at_construction(

@@ -68,7 +68,7 @@ def test_actions_and_commands() -> None:
     assert obs.last_action(env) is action
     assert obs.last_action(env, "arm") is part
     assert obs.generated_commands(env, "twist") is command
-    with pytest.raises(ValueError, match=r"no command 'twits'.*\['twist'\]"):
+    with pytest.raises(ValueError, match=r"command 'twits'.*\['twist'\]"):
         obs.generated_commands(env, "twits")
 
 

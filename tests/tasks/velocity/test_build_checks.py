@@ -20,18 +20,18 @@ def params_of(cfg, term):
 @pytest.mark.parametrize(
     ("term", "param", "message"),
     [
-        ("foot_slip", "sensor_name", "'feet_ground_contct'. Did you mean 'feet_ground_contact'"),
-        ("foot_swing_height", "sensor_name", "no sensor 'feet_ground_contct'"),
-        ("soft_landing", "sensor_name", "no sensor 'feet_ground_contct'"),
-        ("air_time", "sensor_name", "no sensor 'feet_ground_contct'"),
-        ("angular_momentum", "sensor_name", "no sensor 'feet_ground_contct'"),
-        ("foot_clearance", "height_sensor_name", "no sensor 'feet_ground_contct'"),
-        ("track_linear_velocity", "command_name", "no command 'feet_ground_contct'"),
-        ("track_angular_velocity", "command_name", "no command"),
-        ("pose", "command_name", "no command"),
-        ("foot_slip", "command_name", "no command"),
-        ("foot_swing_height", "command_name", "no command"),
-        ("soft_landing", "command_name", "no command"),
+        ("foot_slip", "sensor_name", "'feet_ground_contct'.*did you mean 'feet_ground_contact'"),
+        ("foot_swing_height", "sensor_name", "sensor 'feet_ground_contct'"),
+        ("soft_landing", "sensor_name", "sensor 'feet_ground_contct'"),
+        ("air_time", "sensor_name", "sensor 'feet_ground_contct'"),
+        ("angular_momentum", "sensor_name", "sensor 'feet_ground_contct'"),
+        ("foot_clearance", "height_sensor_name", "sensor 'feet_ground_contct'"),
+        ("track_linear_velocity", "command_name", "command 'feet_ground_contct'"),
+        ("track_angular_velocity", "command_name", "command"),
+        ("pose", "command_name", "command"),
+        ("foot_slip", "command_name", "command"),
+        ("foot_swing_height", "command_name", "command"),
+        ("soft_landing", "command_name", "command"),
     ],
 )
 def test_a_sensor_or_command_that_does_not_exist_is_named_with_near_ones(
@@ -52,9 +52,7 @@ def test_a_sensor_that_observations_need_is_named_too(make_env, group, term):
     def edit(cfg):
         cfg.observations[group].terms[term].params["sensor_name"] = "foot_height_scn"
 
-    with pytest.raises(
-        ValueError, match=f"'critic/{term}': .*no sensor 'foot_height_scn'. Did you"
-    ):
+    with pytest.raises(ValueError, match=f"'critic/{term}': .*sensor 'foot_height_scn'.*did you"):
         make_env(edit=edit)
 
 
@@ -62,7 +60,7 @@ def test_a_sensor_of_another_kind_is_refused_with_those_of_the_right_one(make_en
     def edit(cfg):
         params_of(cfg, "foot_slip")["sensor_name"] = "foot_height_scan"
 
-    message = "is a TerrainHeightSensor, and a ContactSensor is needed.*feet_ground_contact"
+    message = "ContactSensor.*TerrainHeightSensor.*feet_ground_contact"
     with pytest.raises(TypeError, match=message):
         make_env(edit=edit)
 
@@ -71,7 +69,7 @@ def test_a_termination_without_its_sensor_is_refused(make_env):
     def edit(cfg):
         remove_sensors(cfg, "thigh_ground_touch")
 
-    with pytest.raises(ValueError, match="'illegal_contact': .*no sensor 'thigh_ground_touch'"):
+    with pytest.raises(ValueError, match="'illegal_contact': .*sensor 'thigh_ground_touch'"):
         make_env(GO1_ROUGH, edit=edit)
 
 
@@ -169,8 +167,8 @@ def test_heights_of_rays_are_no_heights_of_feet(make_env):
 @pytest.mark.parametrize(
     ("term", "param", "value", "message"),
     [
-        ("track_linear_velocity", "std", -0.5, "std is -0.5; it has to be positive"),
-        ("track_angular_velocity", "std", 0.0, "std is 0.0"),
+        ("track_linear_velocity", "std", -0.5, "std.*-0.5"),
+        ("track_angular_velocity", "std", 0.0, "std.*0.0"),
         ("foot_swing_height", "target_height", 0.0, "target_height is 0.0"),
         ("air_time", "threshold_min", 0.5, "no air time is between them"),
     ],
@@ -198,7 +196,7 @@ def test_upright_needs_rays_of_a_sensor_that_exists(make_env):
     def edit(cfg):
         params_of(cfg, "upright")["terrain_sensor_names"] = ("terrain_scn",)
 
-    with pytest.raises(ValueError, match="'upright': .*'terrain_scn'. Did you mean 'terrain_scan'"):
+    with pytest.raises(ValueError, match="'upright': .*'terrain_scn'.*did you mean 'terrain_scan'"):
         make_env(GO1_ROUGH, edit=edit)
 
 

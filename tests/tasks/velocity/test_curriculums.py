@@ -192,8 +192,8 @@ def test_stages_change_no_config_that_others_hold(make_env):
     ("stage", "message"),
     [
         ({"lin_vel_x": (0.0, 1.0)}, "has no 'step'"),
-        ({"step": 7, "lin_vel": (0.0, 1.0)}, "step 7 has 'lin_vel'. Did you mean 'lin_vel"),
-        ({"step": 7, "ang_vel_z": (1.0, -1.0)}, "ang_vel_z of the stage of step 7 .*wrong way"),
+        ({"step": 7, "lin_vel": (0.0, 1.0)}, "step 7 has 'lin_vel'.*did you mean 'lin_vel"),
+        ({"step": 7, "ang_vel_z": (1.0, -1.0)}, "ang_vel_z of the stage of step 7"),
     ],
 )
 def test_stages_that_make_no_sense_are_refused_when_the_term_is_built(make_env, stage, message):

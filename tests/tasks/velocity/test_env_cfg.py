@@ -113,7 +113,7 @@ def test_rewards_of_the_base_config_that_are_not_filled_in_are_refused(make_env,
     [
         ("body_ang_vel", {}, "asset_cfg selects the bodies [] of entity 'robot'"),
         # As of a robot without the sensor that the base config names.
-        ("angular_momentum", {"sensor_name": "robot/angmom_x"}, "The scene has no sensor"),
+        ("angular_momentum", {"sensor_name": "robot/angmom_x"}, "Unknown sensor 'robot/angmom_x'"),
     ],
 )
 def test_rewards_of_weight_0_may_be_left_unfilled(make_env, caplog, name, params, message):

@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from stand_ins import StandInEnv, contacts, yaw_quat
+from stand_ins import StandInEnv, yaw_quat
 
 from mjlab.managers import RewardTermCfg, SceneEntityCfg
 from mjlab.tasks.velocity import mdp
@@ -122,7 +122,7 @@ def test_upright_looks_at_the_selected_body(go1):
 
 @pytest.mark.parametrize("std", [0.0, -1.0, math.nan])
 def test_a_standard_deviation_that_is_not_positive_is_refused(std):
-    with pytest.raises(ValueError, match="std is .*; it has to be positive"):
+    with pytest.raises(ValueError, match="std"):
         term(mdp.upright, StandInEnv(), std=std)
 
 
@@ -166,26 +166,6 @@ def test_a_diverged_environment_does_not_spoil_what_is_logged():
     env: Any = StandInEnv(angmom=SimpleNamespace(data=momentum))
     mdp.angular_momentum_penalty(env, "angmom")
     assert env.extras["log"]["Metrics/angular_momentum_mean"] == 5.0
-
-
-# Collisions.
-
-
-def test_collisions_count_substeps_with_a_strong_contact():
-    force = torch.zeros(2, 2, 4, 3)
-    force[0, 0, 1] = torch.tensor([6.0, 0.0, 8.1])
-    # The same substep in another slot counts once, and 10 N is not above 10 N.
-    force[0, 1, 1] = torch.tensor([0.0, 30.0, 0.0])
-    force[0, 1, 3] = torch.tensor([-20.0, 0.0, 0.0])
-    force[1, 0, 0] = torch.tensor([10.0, 0.0, 0.0])
-    env: Any = StandInEnv(touch=contacts(force_history=force))
-    assert mdp.self_collision_cost(env, "touch").tolist() == [2.0, 0.0]
-    assert mdp.self_collision_cost(env, "touch", force_threshold=25.0).tolist() == [1.0, 0.0]
-
-
-def test_without_a_history_collisions_count_contacts():
-    env: Any = StandInEnv(touch=contacts(found=torch.tensor([[2.0, 1.0], [0.0, 0.0]])))
-    assert mdp.self_collision_cost(env, "touch").tolist() == [3.0, 0.0]
 
 
 # Posture.
@@ -236,7 +216,7 @@ def test_posture_is_kept_as_loosely_as_the_command_is_fast():
         ({"std_standing": {".*": -0.1}}, r"std_standing: .* above 0, got {'.\*': -0.1}"),
         ({"std_standing": {".*": 0.0}}, "numbers above 0"),
         ({"asset_cfg": SceneEntityCfg("robot")}, "joint_names must be set"),
-        ({"command_name": "twits"}, "There is no command 'twits'. Did you mean 'twist'"),
+        ({"command_name": "twits"}, "command 'twits'.*did you mean 'twist'"),
         ({"walking_threshold": 2.0}, "running cannot start at less motion than walking"),
     ],
 )

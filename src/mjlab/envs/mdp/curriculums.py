@@ -8,9 +8,19 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 import torch
 
+from mjlab.utils.errors import UnknownAttributeError, UnknownNameError, check_exists
+
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.managers.curriculum_manager import CurriculumTermCfg
+
+
+__all__ = [
+    "RewardCurriculumStage",
+    "TerminationCurriculumStage",
+    "reward_curriculum",
+    "termination_curriculum",
+]
 
 
 class RewardCurriculumStage(TypedDict, total=False):
@@ -39,14 +49,28 @@ class _StagedCurriculum:
     """Applies stages, in order, to the live config of a term."""
 
     _kind = ""
-    _name_param = ""
 
     def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
-        name, stages = cfg.params[self._name_param], cfg.params["stages"]
-        _check_stages(f"{self._kind} {name!r}", self._live_cfg(env, name), stages)
+        name, stages = cfg.params[f"{self._kind}_name"], cfg.params["stages"]
+        owner, term_cfg = f"{self._kind} {name!r}", self._live_cfg(env, name)
+        known = {field.name for field in dataclasses.fields(term_cfg)} - {"func", "params"}
+        previous = None
+        for stage in stages:
+            if "step" not in stage:
+                raise ValueError(f"Curriculum of {owner}: the stage {stage!r} has no 'step'.")
+            if previous is not None and stage["step"] < previous:
+                raise ValueError(
+                    f"Curriculum of {owner}: stages must be in order of their steps, but {stage['step']} comes "
+                    f"after {previous}."
+                )
+            previous = stage["step"]
+            for field in _fields(stage):
+                check_exists(f"field of {owner}", field, sorted(known), UnknownAttributeError)
+            for param in stage.get("params", {}):
+                check_exists(f"parameter of {owner}", param, term_cfg.params, UnknownNameError)
 
     def _live_cfg(self, env: ManagerBasedRlEnv, name: str) -> Any:
-        raise NotImplementedError
+        return getattr(env, f"{self._kind}_manager").get_term_cfg(name)
 
     def _apply(
         self, env: ManagerBasedRlEnv, name: str, stages: Sequence[Any]
@@ -81,7 +105,7 @@ class reward_curriculum(_StagedCurriculum):
     for fields that the config does not have, `KeyError` for parameters that the term does not have.
     """
 
-    _kind, _name_param = "reward", "reward_name"
+    _kind = "reward"
 
     def __call__(
         self,
@@ -92,9 +116,6 @@ class reward_curriculum(_StagedCurriculum):
     ) -> dict[str, torch.Tensor]:
         return self._apply(env, reward_name, stages)
 
-    def _live_cfg(self, env: ManagerBasedRlEnv, name: str) -> Any:
-        return env.reward_manager.get_term_cfg(name)
-
 
 class termination_curriculum(_StagedCurriculum):
     """Changes `time_out` and parameters of a termination term, stage by stage.
@@ -102,7 +123,7 @@ class termination_curriculum(_StagedCurriculum):
     As `reward_curriculum`, with `termination_name` for the name of the term.
     """
 
-    _kind, _name_param = "termination", "termination_name"
+    _kind = "termination"
 
     def __call__(
         self,
@@ -113,35 +134,6 @@ class termination_curriculum(_StagedCurriculum):
     ) -> dict[str, torch.Tensor]:
         return self._apply(env, termination_name, stages)
 
-    def _live_cfg(self, env: ManagerBasedRlEnv, name: str) -> Any:
-        return env.termination_manager.get_term_cfg(name)
-
 
 def _fields(stage: Any) -> list[str]:
     return [key for key in stage if key not in ("step", "params")]
-
-
-def _check_stages(term: str, cfg: Any, stages: Sequence[Any]) -> None:
-    known = {field.name for field in dataclasses.fields(cfg)} - {"func", "params"}
-    previous = None
-    for stage in stages:
-        if "step" not in stage:
-            raise ValueError(f"Curriculum of {term}: the stage {stage!r} has no 'step'.")
-        if previous is not None and stage["step"] < previous:
-            raise ValueError(
-                f"Curriculum of {term}: stages must be in order of their steps, but "
-                f"{stage['step']} comes after {previous}."
-            )
-        previous = stage["step"]
-        unknown = [field for field in _fields(stage) if field not in known]
-        if unknown:
-            raise AttributeError(
-                f"Curriculum of {term}: {type(cfg).__name__} has no fields {unknown} that a stage "
-                f"could set. It has {sorted(known)}; parameters go into 'params'."
-            )
-        missing = [param for param in stage.get("params", {}) if param not in cfg.params]
-        if missing:
-            raise KeyError(
-                f"Curriculum of {term}: the term has no parameters {missing}; "
-                f"it has {sorted(cfg.params)}."
-            )

@@ -10,6 +10,11 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
 
+__all__ = [
+    "mean_action_acc",
+]
+
+
 def mean_action_acc(env: ManagerBasedRlEnv) -> torch.Tensor:
     """Mean over the action's components of the absolute second difference of the raw action."""
     actions = env.action_manager

@@ -13,11 +13,25 @@ import torch
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.sensor.builtin_sensor import BuiltinSensor
+from mjlab.utils.errors import WrongTypeError, check_exists
 from mjlab.utils.indexing import as_columns
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
+
+__all__ = [
+    "base_ang_vel",
+    "base_lin_vel",
+    "builtin_sensor",
+    "generated_commands",
+    "height_scan",
+    "joint_pos_rel",
+    "joint_vel_rel",
+    "last_action",
+    "projected_gravity",
+    "projected_gravity_from_sensor",
+]
 
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 
@@ -88,10 +102,7 @@ def generated_commands(env: ManagerBasedRlEnv, command_name: str) -> torch.Tenso
     """
     command = env.command_manager.get_command(command_name)
     if command is None:
-        raise ValueError(
-            f"There is no command {command_name!r}; the environment's command terms are "
-            f"{list(env.command_manager.active_terms)}. Add it to the config's commands."
-        )
+        check_exists("command", command_name, env.command_manager.active_terms)
     return command
 
 
@@ -138,7 +149,7 @@ def height_scan(
 def _builtin(env: ManagerBasedRlEnv, sensor_name: str) -> BuiltinSensor:
     sensor = env.scene[sensor_name]
     if not isinstance(sensor, BuiltinSensor):
-        raise TypeError(
+        raise WrongTypeError(
             f"{sensor_name!r} is a {type(sensor).__name__}, not a BuiltinSensor. Give the name of "
             "a MuJoCo sensor, such as 'robot/imu_gyro'."
         )

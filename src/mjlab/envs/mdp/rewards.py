@@ -8,6 +8,7 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.managers.term_checks import check_contact_sensor, checked_when_built
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.string import resolve_matching_names_values
 
@@ -15,6 +16,21 @@ if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.managers.reward_manager import RewardTermCfg
+
+__all__ = [
+    "action_acc_l2",
+    "action_rate_l2",
+    "electrical_power_cost",
+    "flat_orientation_l2",
+    "is_alive",
+    "is_terminated",
+    "joint_acc_l2",
+    "joint_pos_limits",
+    "joint_torques_l2",
+    "joint_vel_l2",
+    "posture",
+    "self_collision_cost",
+]
 
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 
@@ -92,6 +108,22 @@ def flat_orientation_l2(
     """Squared horizontal part of the projected gravity: sin^2 of the tilt of the root."""
     asset: Entity = env.scene[asset_cfg.name]
     return asset.data.projected_gravity_b[:, :2].square().sum(dim=1)
+
+
+@checked_when_built(check_contact_sensor)
+def self_collision_cost(
+    env: ManagerBasedRlEnv, sensor_name: str, force_threshold: float = 10.0
+) -> torch.Tensor:
+    """Count unwanted contacts, of the robot with itself or with the ground.
+
+    With a history of forces it is the number of those last substeps in which any contact had a
+    force above `force_threshold` (N), without one the number of contacts.
+    """
+    data = env.scene[sensor_name].data
+    if data.force_history is None:
+        return data.found.sum(dim=1).float()
+    hits = data.force_history.square().sum(dim=-1) > force_threshold**2
+    return hits.any(dim=1).sum(dim=1).float()
 
 
 class posture:

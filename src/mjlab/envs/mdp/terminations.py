@@ -14,6 +14,13 @@ if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
 
+__all__ = [
+    "bad_orientation",
+    "nan_detection",
+    "root_height_below_minimum",
+    "time_out",
+]
+
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 
 

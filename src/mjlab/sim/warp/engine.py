@@ -117,7 +117,6 @@ class WarpEngine(Engine):
         self.num_envs = num_envs
         self.device = torch.device(device)
         self.wp_device = _find_device(self.device)
-        self._on_cuda: bool = self.wp_device.is_cuda
         self.mj_model = model
         self._host = mujoco.MjData(model)
         mujoco.mj_forward(model, self._host)
@@ -190,6 +189,10 @@ class WarpEngine(Engine):
             self.wp_model.opt.graph_conditional = wp.is_conditional_graph_supported()
 
     # Order of work on the GPU.
+
+    @property
+    def _on_cuda(self) -> bool:
+        return self.wp_device.is_cuda
 
     @contextmanager
     def ordered(self) -> Generator[None]:

@@ -30,6 +30,7 @@ class DelayBuffer:
             "_update_period",
             "_random_phase",
             "_num_draws",
+            "_draw_device",
         }
     )
 
@@ -74,6 +75,8 @@ class DelayBuffer:
         self._update_period = update_period
         self._random_phase = per_env_phase and update_period > 0
         self._generator = generator
+        # A generator only makes numbers on its own device.
+        self._draw_device = device if generator is None else generator.device
         self._buffer = CircularBuffer(max_lag + 1, batch_size, device)
         # What is drawn: one entry a row, or a single one for all of them.
         self._num_draws = batch_size if per_env else 1
@@ -155,8 +158,12 @@ class DelayBuffer:
         if self._update_period > 0:
             change = (self._step_count + self._phase) % self._update_period == 0
         if self._hold_prob > 0:
-            size, device = self._num_draws, self._source_device()
-            draw = torch.rand(size, dtype=torch.float32, generator=self._generator, device=device)
+            draw = torch.rand(
+                self._num_draws,
+                dtype=torch.float32,
+                generator=self._generator,
+                device=self._draw_device,
+            )
             moved = draw.to(self._device) >= self._hold_prob
             change = moved if change is None else change & moved
         self._step_count += 1
@@ -179,9 +186,5 @@ class DelayBuffer:
         if high - low == 1:
             return torch.full((self._num_draws,), low, dtype=torch.int64, device=self._device)
         return torch.randint(
-            low, high, (self._num_draws,), generator=self._generator, device=self._source_device()
+            low, high, (self._num_draws,), generator=self._generator, device=self._draw_device
         ).to(self._device)
-
-    def _source_device(self) -> torch.device | str:
-        # A generator only makes numbers on its own device.
-        return self._device if self._generator is None else self._generator.device

@@ -1,4 +1,7 @@
-"""Videos of an environment while something else steps it, each file written whole or not at all."""
+"""Videos of an environment that something else steps.
+
+`VideoRecorder` wraps the environment and writes clips; `ClipWriter` writes one file, whole or not at all.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +17,15 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from mjlab.envs import ManagerBasedRlEnv
+from mjlab.utils.errors import check_count, check_one_of
 from mjlab.utils.os import create_locked, remove_temporary_files, rename_locked, temporary_path
 from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
 
 if TYPE_CHECKING:
     import torch
 
-
 log = logging.getLogger(__name__)
+
 _DEFAULT_FPS = 30.0
 _CODECS = {
     ".mp4": "-an -c:v libx264 -pix_fmt yuv420p -crf 20 -movflags +faststart",
@@ -42,21 +46,6 @@ class VideoRecorder(ManagerBasedRlEnv):
     recorder is closed: what was recorded is never lost. Where this machine cannot render, that is
     logged once and stepping goes on (`unavailable_reason`).
     """
-
-    env: ManagerBasedRlEnv
-    video_folder: Path
-    written: list[Path]
-    unavailable_reason: str | None
-    _episode_trigger: Callable[[int], bool] | None
-    _step_trigger: Callable[[int], bool] | None
-    _video_length: int | None
-    _name_prefix: str
-    _disable_logger: bool
-    _clip: ClipWriter | None
-    _step_count: int
-    _episode_count: int
-    _episode_steps: int
-    _asked_episode: int
 
     def __init__(
         self,
@@ -87,34 +76,35 @@ class VideoRecorder(ManagerBasedRlEnv):
             raise ValueError(
                 "VideoRecorder would never record: give it an episode_trigger or a step_trigger."
             )
-        if video_length is not None and video_length < 1:
-            raise ValueError(
-                f"video_length is {video_length}; it must be 1 or more, or None for an episode."
-            )
-        self.env = env
+        if video_length is not None:
+            check_count("video_length", video_length)
         self.video_folder = Path(video_folder)
-        self.written = []
-        self.unavailable_reason = None
+        self.written: list[Path] = []
+        self.unavailable_reason: str | None = None
         self._episode_trigger = episode_trigger
         self._step_trigger = step_trigger
         self._video_length = video_length
         self._name_prefix = name_prefix
         self._disable_logger = disable_logger
-        self._clip = None
+        self._clip: ClipWriter | None = None
         self._step_count = 0
         self._episode_count = 0
         self._episode_steps = 0
         self._asked_episode = -1
+        # Last: attributes set before it are the recorder's, all others are the environment's.
+        self.env = env
 
     def __getattribute__(self, name: str) -> Any:
         # Not __getattr__: the base class has properties of the environment, which would be found
         # first and evaluated on the recorder.
-        if name.startswith("__") or name in _OWN:
+        own = object.__getattribute__(self, "__dict__")
+        if name in own or name in vars(VideoRecorder) or name.startswith("__"):
             return object.__getattribute__(self, name)
         return getattr(object.__getattribute__(self, "env"), name)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in _OWN:
+        own = vars(self)
+        if name in own or name in vars(VideoRecorder) or "env" not in own:
             object.__setattr__(self, name, value)
         else:
             setattr(self.env, name, value)
@@ -159,9 +149,9 @@ class VideoRecorder(ManagerBasedRlEnv):
         suffix = None
         if self._step_trigger is not None and self._step_trigger(self._step_count):
             suffix = f"step-{self._step_count}"
+        # Asked once an episode, or a clip shorter than its episode would be recorded again and
+        # again into the same file.
         elif self._episode_trigger is not None and self._asked_episode != self._episode_count:
-            # Asked once an episode, or a clip shorter than its episode would be recorded again and
-            # again into the same file.
             self._asked_episode = self._episode_count
             if self._episode_trigger(self._episode_count):
                 suffix = f"episode-{self._episode_count}"
@@ -216,10 +206,6 @@ class VideoRecorder(ManagerBasedRlEnv):
                 log.info("Wrote %d frames to %s.", clip.num_frames, path)
 
 
-# Names that are the recorder's and not the environment's.
-_OWN = frozenset(VideoRecorder.__annotations__) | frozenset(vars(VideoRecorder))
-
-
 class ClipWriter:
     """Streams frames into an mp4 or gif that appears under its name only once it is complete.
 
@@ -238,8 +224,7 @@ class ClipWriter:
         Raises:
             ValueError: The name does not end in .mp4 or .gif.
         """
-        if path.suffix not in _CODECS:
-            raise ValueError(f"{path.name!r} has to end in one of {', '.join(_CODECS)}.")
+        check_one_of(f"suffix of {path.name!r}", path.suffix, _CODECS)
         self.path = path
         self.fps = fps
         self.num_frames = 0

@@ -1,4 +1,7 @@
-"""MuJoCo's own window, following one environment of a running policy."""
+"""MuJoCo's own window, following one environment of a running policy.
+
+The mouse pushes bodies (`MousePush`), and curves of the reward terms can be drawn over the picture.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ from mjlab.viewer.model_sync import (
     to_numpy,
 )
 from mjlab.viewer.native.keys import KEY_HELP, action_of_key
-from mjlab.viewer.native.visualizer import MujocoNativeDebugVisualizer
+from mjlab.viewer.native.visualizer import MujocoNativeDebugVisualizer, add_moving_geoms
 from mjlab.viewer.offscreen_renderer import RenderingUnavailableError, move_sun, prepare_sun
 
 if TYPE_CHECKING:
@@ -36,105 +39,10 @@ if TYPE_CHECKING:
     from mjlab.viewer.base import EnvProtocol, PolicyProtocol
 
 
-# MERGED mjlab.viewer.native.viewer: Whether this machine has a display to open a window on.
+log = logging.getLogger(__name__)
 
-
-def require_display() -> None:
-    """Check that a window can be opened.
-
-    Raises:
-        RenderingUnavailableError: There is no display. (GLFW itself would end the program.)
-    """
-    if sys.platform != "linux":
-        return
-    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise RenderingUnavailableError(
-            "MuJoCo's window needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set. "
-            "Use the browser viewer instead (--viewer viser)."
-        )
-    import glfw
-
-    if not glfw.init():
-        raise RenderingUnavailableError(
-            f"MuJoCo's window cannot open on DISPLAY={os.environ.get('DISPLAY')!r}: the display "
-            "server does not answer. Use the browser viewer instead (--viewer viser)."
-        )
-
-
-# MERGED mjlab.viewer.native.viewer: Pushing bodies with the mouse.
-
-
-class MousePush:
-    """Turns the window's mouse force into `qfrc_applied` of one environment.
-
-    Wrenches that tasks script stay in `xfrc_applied`, and generalised forces that a task wrote
-    itself are added to, not replaced: they are put back when the push ends.
-    """
-
-    def __init__(self, model: mujoco.MjModel):
-        self._model = model
-        self._env_idx: int | None = None
-        self._base: np.ndarray | None = None
-        self._written: np.ndarray | None = None
-
-    @property
-    def active(self) -> bool:
-        """Whether a force of the mouse stands in an environment."""
-        return self._env_idx is not None
-
-    def apply(
-        self, sim: Any, env_idx: int, data: mujoco.MjData, perturb: mujoco.MjvPerturb
-    ) -> None:
-        """Write the force of `perturb` for the next step; `data` holds the state it acts on."""
-        if not perturb.active or perturb.select <= 0:
-            self.release(sim)
-            return
-        force = self._generalised_force(data, perturb)
-        self._take_base(sim, env_idx)
-        assert self._base is not None
-        self._write(sim, env_idx, self._base + force)
-
-    def release(self, sim: Any) -> None:
-        """Take the push back; what the environment itself applies stays."""
-        if self._env_idx is None or self._base is None:
-            return
-        if self._is_ours(sim, self._env_idx):
-            self._write(sim, self._env_idx, self._base)
-        self._env_idx = self._base = self._written = None
-
-    def _take_base(self, sim: Any, env_idx: int) -> None:
-        if self._env_idx != env_idx:
-            self.release(sim)
-        # A reset or the task overwrote the row: what stands there now is the task's.
-        if self._base is None or not self._is_ours(sim, env_idx):
-            self._base = _row(sim, env_idx)
-        self._env_idx = env_idx
-
-    def _is_ours(self, sim: Any, env_idx: int) -> bool:
-        return self._written is not None and np.array_equal(_row(sim, env_idx), self._written)
-
-    def _write(self, sim: Any, env_idx: int, force: np.ndarray) -> None:
-        rows = sim.data.qfrc_applied
-        rows[env_idx] = torch.as_tensor(force, dtype=rows.dtype, device=rows.device)
-        self._written = _row(sim, env_idx)
-
-    def _generalised_force(self, data: mujoco.MjData, perturb: mujoco.MjvPerturb) -> np.ndarray:
-        scripted = data.xfrc_applied.copy()
-        data.xfrc_applied[:] = 0.0
-        mujoco.mjv_applyPerturbForce(self._model, data, perturb)
-        wrench = data.xfrc_applied[perturb.select].copy()
-        data.xfrc_applied[:] = scripted
-        force = np.zeros(self._model.nv)
-        point = data.xipos[perturb.select].copy()
-        mujoco.mj_applyFT(self._model, data, wrench[:3], wrench[3:], point, perturb.select, force)
-        return force
-
-
-def _row(sim: Any, env_idx: int) -> np.ndarray:
-    return to_numpy(sim.data.qfrc_applied[env_idx]).copy()
-
-
-# MERGED mjlab.viewer.native.viewer: Curves of the reward terms, drawn over the native window.
+_MARKER_COLOR = (0.9, 0.1, 0.1, 0.9)
+_CLOSING_TIMEOUT_S = 5.0
 
 
 @dataclass
@@ -165,105 +73,6 @@ class PlotCfg:
     """Fraction of the window's width that all columns together take."""
     background_alpha: float = 0.5
     """Opacity of the plots' black background."""
-
-
-def reward_figures(
-    history: TermHistory, viewport: mujoco.MjrRect, cfg: PlotCfg
-) -> list[tuple[mujoco.MjrRect, mujoco.MjvFigure]]:
-    """Return one figure per term and its place, for the first `cfg.max_viewports` terms."""
-    places = compute_viewports(len(history.names), viewport, cfg)
-    return [
-        (place, _figure(name, history.values(name), cfg))
-        for place, name in zip(places, history.names, strict=False)
-    ]
-
-
-def compute_viewports(num_plots: int, rect: mujoco.MjrRect, cfg: PlotCfg) -> list[mujoco.MjrRect]:
-    """Return the places of `num_plots` plots in `rect`: from the top, columns from the right."""
-    count = min(num_plots, cfg.max_viewports)
-    if count < 1:
-        return []
-    most_columns = math.ceil(cfg.max_viewports / cfg.max_rows_per_col)
-    columns = math.ceil(count / cfg.max_rows_per_col)
-    rows = max(math.ceil(count / columns), cfg.min_rows_per_col)
-    rows = min(rows, cfg.max_rows_per_col)
-    width = int(cfg.plot_strip_fraction * rect.width) // most_columns
-    height = rect.height // rows
-    right, top = rect.left + rect.width, rect.bottom + rect.height
-    cells = (divmod(index, rows) for index in range(count))
-    return [
-        mujoco.MjrRect(right - (column + 1) * width, top - (row + 1) * height, width, height)
-        for column, row in cells
-    ]
-
-
-def make_empty_figure(
-    title: str,
-    grid_size: tuple[int, int],
-    yrange: tuple[float, float],
-    history: int,
-    alpha: float,
-) -> mujoco.MjvFigure:
-    """Return a figure whose line 0 has `history` points at x = 0, -1, ... and y = 0.
-
-    Args:
-        title: Title of the figure.
-        grid_size: Number of grid lines along x and y.
-        yrange: Lowest and highest y shown.
-        history: Number of points, at most what MuJoCo has room for (1001).
-        alpha: Opacity of the black background.
-    """
-    figure = mujoco.MjvFigure()
-    mujoco.mjv_defaultFigure(figure)
-    figure.title = title
-    figure.gridsize[:] = grid_size
-    figure.range[1][:] = yrange
-    figure.figurergba[:] = (0.0, 0.0, 0.0, alpha)
-    count = min(history, figure.linedata.shape[1] // 2)
-    figure.linedata[0, 0 : 2 * count : 2] = -np.arange(count)
-    return figure
-
-
-def plot_scale(values: np.ndarray, cfg: PlotCfg) -> tuple[int, float, float]:
-    """Return the exponent of ten to divide a curve by, and its y-range.
-
-    The range spans the percentiles of `cfg`, padded. Curves whose magnitude is outside
-    [0.01, 1000) are scaled by a power of ten.
-    """
-    finite = values[np.isfinite(values)]
-    magnitude = float(np.abs(finite).max(initial=0.0))
-    if magnitude == 0.0:
-        return 0, *cfg.init_yrange
-    exponent = 0 if 0.01 <= magnitude < 1000.0 else math.floor(math.log10(magnitude))
-    low, high = np.percentile(finite / 10.0**exponent, [cfg.p_lo, cfg.p_hi])
-    # A flat curve gets a range too, wide enough for the labels of its axis to differ.
-    padding = cfg.pad * max(high - low, 0.4 * abs(high), 0.4 * abs(low), cfg.min_span)
-    return exponent, float(low - padding), float(high + padding)
-
-
-def _figure(name: str, values: np.ndarray, cfg: PlotCfg) -> mujoco.MjvFigure:
-    exponent, low, high = plot_scale(values, cfg)
-    title = name if exponent == 0 else f"{name} (1e{exponent})"
-    figure = make_empty_figure(title, cfg.grid_size, (low, high), cfg.history, cfg.background_alpha)
-    figure.flg_extend = 0
-    figure.linewidth = 2.0
-    figure.range[0][:] = (-cfg.history, 0)
-    figure.linergb[0][:] = (0.3, 0.8, 1.0)
-    # The points are x, y pairs in one row; values that are not finite leave a gap.
-    latest = values[-(figure.linedata.shape[1] // 2) :]
-    steps = np.arange(1 - len(latest), 1)
-    shown = np.isfinite(latest)
-    count = int(shown.sum())
-    figure.linepnt[0] = count
-    figure.linedata[0, 0 : 2 * count : 2] = steps[shown]
-    figure.linedata[0, 1 : 2 * count : 2] = np.clip(latest[shown] / 10.0**exponent, low, high)
-    return figure
-
-
-log = logging.getLogger(__name__)
-_MARKER_COLOR = (0.9, 0.1, 0.1, 0.9)
-_CLOSING_TIMEOUT_S = 5.0
-_NO_PERTURBATION = mujoco.MjvPerturb()
 
 
 class NativeMujocoViewer(BaseViewer):
@@ -352,7 +161,8 @@ class NativeMujocoViewer(BaseViewer):
                 f"Cannot open MuJoCo's window: {error}. Use the browser viewer (--viewer viser)."
             ) from error
         self._window_threads = set(threading.enumerate()) - others
-        self._configure_window(self._handle)
+        with self._handle.lock():
+            self._configure_window(self._handle)
 
     def is_running(self) -> bool:
         return self._handle is not None and self._handle.is_running()
@@ -374,7 +184,12 @@ class NativeMujocoViewer(BaseViewer):
             return
         with handle.lock():
             self._load_selected()
-            self._draw_extras(handle)
+            self._update_debug_visualizers(handle)
+            if self._view.body_id is not None and self._com_differs:
+                handle.cam.lookat[:] = self._view.target(self.mjd.xpos)
+            if self.env.unwrapped.num_envs > 1:
+                self._mark_selected(self._visualizer_of(handle.user_scn))
+                self._draw_neighbours(handle.user_scn)
         handle.set_texts(self._overlay())
         if self._show_plots and handle.viewport is not None:
             handle.set_figures(reward_figures(self._rewards, handle.viewport, self._plot_cfg))
@@ -429,38 +244,28 @@ class NativeMujocoViewer(BaseViewer):
             self._user_key_callback(key)
 
     def _configure_window(self, handle: mujoco.viewer.Handle) -> None:
-        with handle.lock():
-            camera = handle.cam
-            camera.lookat[:] = self._view.target(self.mjd.xpos)
-            camera.distance = self._view.distance
-            camera.azimuth = self._view.azimuth
-            camera.elevation = self._view.elevation
-            if self._view.body_id is not None and not self._com_differs:
-                camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
-                camera.trackbodyid = self._view.body_id
-            handle.opt.frame = mujoco.mjtFrame.mjFRAME_WORLD
-            handle.opt.flags[mujoco.mjtVisFlag.mjVIS_SCLINERTIA] = 1
-            handle.opt.geomgroup[:] = self.cfg.geom_group
-            handle.opt.sitegroup[:] = self.cfg.site_group
-            flags = handle.user_scn.flags
-            flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self.cfg.enable_shadows
-            flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = self.cfg.enable_reflections
+        camera = handle.cam
+        camera.lookat[:] = self._view.target(self.mjd.xpos)
+        camera.distance = self._view.distance
+        camera.azimuth = self._view.azimuth
+        camera.elevation = self._view.elevation
+        if self._view.body_id is not None and not self._com_differs:
+            camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+            camera.trackbodyid = self._view.body_id
+        handle.opt.frame = mujoco.mjtFrame.mjFRAME_WORLD
+        handle.opt.flags[mujoco.mjtVisFlag.mjVIS_SCLINERTIA] = 1
+        handle.opt.geomgroup[:] = self.cfg.geom_group
+        handle.opt.sitegroup[:] = self.cfg.site_group
+        flags = handle.user_scn.flags
+        flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self.cfg.enable_shadows
+        flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = self.cfg.enable_reflections
 
     def _load_selected(self) -> None:
         sim = self.env.unwrapped.sim
-        if sim.expanded_fields:
-            sync_model_fields(self.mjm, sim.model, sim.expanded_fields, self.env_idx)
+        sync_model_fields(self.mjm, sim.model, sim.expanded_fields, self.env_idx)
         copy_state(sim, self.env_idx, self.mjd)
         mujoco.mj_forward(self.mjm, self.mjd)
         move_sun(self.mjm, self.mjd, self._view.target(self.mjd.xpos))
-
-    def _draw_extras(self, viewer: mujoco.viewer.Handle) -> None:
-        self._update_debug_visualizers(viewer)
-        if self._view.body_id is not None and self._com_differs:
-            viewer.cam.lookat[:] = self._view.target(self.mjd.xpos)
-        if self.env.unwrapped.num_envs > 1:
-            self._mark_selected(self._visualizer_of(viewer.user_scn))
-            self._draw_neighbours(viewer.user_scn)
 
     def _update_debug_visualizers(self, viewer: mujoco.viewer.Handle) -> None:
         """Replace the geoms of `viewer.user_scn` by the environment's debug drawings.
@@ -501,18 +306,10 @@ class NativeMujocoViewer(BaseViewer):
         option.geomgroup[:] = self.cfg.geom_group
         option.sitegroup[:] = self.cfg.site_group
         for env_idx in nearest_envs(origins, self.env_idx, self.cfg.max_extra_envs):
-            if sim.expanded_fields:
-                sync_model_fields(self._extra_model, sim.model, sim.expanded_fields, env_idx)
+            sync_model_fields(self._extra_model, sim.model, sim.expanded_fields, env_idx)
             copy_state(sim, env_idx, self._extra_data)
             compute_poses(self._extra_model, self._extra_data)
-            mujoco.mjv_addGeoms(
-                self._extra_model,
-                self._extra_data,
-                option,
-                _NO_PERTURBATION,
-                int(mujoco.mjtCatBit.mjCAT_DYNAMIC),
-                scn,
-            )
+            add_moving_geoms(scn, self._extra_model, self._extra_data, option)
 
     def _overlay(self) -> list[tuple[int | None, int | None, str | None, str | None]]:
         status = self.get_status()
@@ -535,3 +332,182 @@ class NativeMujocoViewer(BaseViewer):
         names, values = ("\n".join(column) for column in zip(*rows, strict=True))
         keys, meanings = ("\n".join(column) for column in zip(*KEY_HELP, strict=True))
         return [(font, int(top), names, values), (font, int(bottom), keys, meanings)]
+
+
+def require_display() -> None:
+    """Check that a window can be opened.
+
+    Raises:
+        RenderingUnavailableError: There is no display. (GLFW itself would end the program.)
+    """
+    if sys.platform != "linux":
+        return
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise RenderingUnavailableError(
+            "MuJoCo's window needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set. "
+            "Use the browser viewer instead (--viewer viser)."
+        )
+    import glfw
+
+    if not glfw.init():
+        raise RenderingUnavailableError(
+            f"MuJoCo's window cannot open on DISPLAY={os.environ.get('DISPLAY')!r}: the display "
+            "server does not answer. Use the browser viewer instead (--viewer viser)."
+        )
+
+
+class MousePush:
+    """Turns the window's mouse force into `qfrc_applied` of one environment.
+
+    Wrenches that tasks script stay in `xfrc_applied`, and generalised forces that a task wrote
+    itself are added to, not replaced: they are put back when the push ends.
+    """
+
+    def __init__(self, model: mujoco.MjModel):
+        self._model = model
+        self._env_idx: int | None = None
+        self._base: np.ndarray | None = None
+        self._written: np.ndarray | None = None
+
+    @property
+    def active(self) -> bool:
+        """Whether a force of the mouse stands in an environment."""
+        return self._env_idx is not None
+
+    def apply(
+        self, sim: Any, env_idx: int, data: mujoco.MjData, perturb: mujoco.MjvPerturb
+    ) -> None:
+        """Write the force of `perturb` for the next step; `data` holds the state it acts on."""
+        if not perturb.active or perturb.select <= 0:
+            self.release(sim)
+            return
+        if self._env_idx != env_idx:
+            self.release(sim)
+        # A reset or the task overwrote the row: what stands there now is the task's.
+        if self._base is None or not self._is_ours(sim, env_idx):
+            self._base = _row(sim, env_idx)
+        self._env_idx = env_idx
+        self._write(sim, env_idx, self._base + self._generalised_force(data, perturb))
+
+    def release(self, sim: Any) -> None:
+        """Take the push back; what the environment itself applies stays."""
+        if self._env_idx is None or self._base is None:
+            return
+        if self._is_ours(sim, self._env_idx):
+            self._write(sim, self._env_idx, self._base)
+        self._env_idx = self._base = self._written = None
+
+    def _is_ours(self, sim: Any, env_idx: int) -> bool:
+        return self._written is not None and np.array_equal(_row(sim, env_idx), self._written)
+
+    def _write(self, sim: Any, env_idx: int, force: np.ndarray) -> None:
+        rows = sim.data.qfrc_applied
+        rows[env_idx] = torch.as_tensor(force, dtype=rows.dtype, device=rows.device)
+        self._written = _row(sim, env_idx)
+
+    def _generalised_force(self, data: mujoco.MjData, perturb: mujoco.MjvPerturb) -> np.ndarray:
+        scripted = data.xfrc_applied.copy()
+        data.xfrc_applied[:] = 0.0
+        mujoco.mjv_applyPerturbForce(self._model, data, perturb)
+        wrench = data.xfrc_applied[perturb.select].copy()
+        data.xfrc_applied[:] = scripted
+        force = np.zeros(self._model.nv)
+        point = data.xipos[perturb.select].copy()
+        mujoco.mj_applyFT(self._model, data, wrench[:3], wrench[3:], point, perturb.select, force)
+        return force
+
+
+def _row(sim: Any, env_idx: int) -> np.ndarray:
+    return to_numpy(sim.data.qfrc_applied[env_idx]).copy()
+
+
+def reward_figures(
+    history: TermHistory, viewport: mujoco.MjrRect, cfg: PlotCfg
+) -> list[tuple[mujoco.MjrRect, mujoco.MjvFigure]]:
+    """Return one figure per term and its place, for the first `cfg.max_viewports` terms."""
+    figures = []
+    for place, name in zip(
+        compute_viewports(len(history.names), viewport, cfg), history.names, strict=False
+    ):
+        values = history.values(name)
+        exponent, low, high = plot_scale(values, cfg)
+        title = name if exponent == 0 else f"{name} (1e{exponent})"
+        yrange = (low, high)
+        figure = make_empty_figure(title, cfg.grid_size, yrange, cfg.history, cfg.background_alpha)
+        figure.flg_extend = 0
+        figure.linewidth = 2.0
+        figure.range[0][:] = (-cfg.history, 0)
+        figure.linergb[0][:] = (0.3, 0.8, 1.0)
+        # The points are x, y pairs in one row; values that are not finite leave a gap.
+        latest = values[-(figure.linedata.shape[1] // 2) :]
+        steps = np.arange(1 - len(latest), 1)
+        shown = np.isfinite(latest)
+        count = int(shown.sum())
+        figure.linepnt[0] = count
+        figure.linedata[0, 0 : 2 * count : 2] = steps[shown]
+        figure.linedata[0, 1 : 2 * count : 2] = np.clip(latest[shown] / 10.0**exponent, low, high)
+        figures.append((place, figure))
+    return figures
+
+
+def compute_viewports(num_plots: int, rect: mujoco.MjrRect, cfg: PlotCfg) -> list[mujoco.MjrRect]:
+    """Return the places of `num_plots` plots in `rect`: from the top, columns from the right."""
+    count = min(num_plots, cfg.max_viewports)
+    if count < 1:
+        return []
+    most_columns = math.ceil(cfg.max_viewports / cfg.max_rows_per_col)
+    columns = math.ceil(count / cfg.max_rows_per_col)
+    rows = max(math.ceil(count / columns), cfg.min_rows_per_col)
+    rows = min(rows, cfg.max_rows_per_col)
+    width = int(cfg.plot_strip_fraction * rect.width) // most_columns
+    height = rect.height // rows
+    right, top = rect.left + rect.width, rect.bottom + rect.height
+    cells = (divmod(index, rows) for index in range(count))
+    return [
+        mujoco.MjrRect(right - (column + 1) * width, top - (row + 1) * height, width, height)
+        for column, row in cells
+    ]
+
+
+def make_empty_figure(
+    title: str,
+    grid_size: tuple[int, int],
+    yrange: tuple[float, float],
+    history: int,
+    alpha: float,
+) -> mujoco.MjvFigure:
+    """Return a figure whose line 0 has `history` points at x = 0, -1, ... and y = 0.
+
+    Args:
+        title: Title of the figure.
+        grid_size: Number of grid lines along x and y.
+        yrange: Lowest and highest y shown.
+        history: Number of points, at most what MuJoCo has room for (1001).
+        alpha: Opacity of the black background.
+    """
+    figure = mujoco.MjvFigure()
+    mujoco.mjv_defaultFigure(figure)
+    figure.title = title
+    figure.gridsize[:] = grid_size
+    figure.range[1][:] = yrange
+    figure.figurergba[:] = (0.0, 0.0, 0.0, alpha)
+    count = min(history, figure.linedata.shape[1] // 2)
+    figure.linedata[0, 0 : 2 * count : 2] = -np.arange(count)
+    return figure
+
+
+def plot_scale(values: np.ndarray, cfg: PlotCfg) -> tuple[int, float, float]:
+    """Return the exponent of ten to divide a curve by, and its y-range.
+
+    The range spans the percentiles of `cfg`, padded. Curves whose magnitude is outside
+    [0.01, 1000) are scaled by a power of ten.
+    """
+    finite = values[np.isfinite(values)]
+    magnitude = float(np.abs(finite).max(initial=0.0))
+    if magnitude == 0.0:
+        return 0, *cfg.init_yrange
+    exponent = 0 if 0.01 <= magnitude < 1000.0 else math.floor(math.log10(magnitude))
+    low, high = np.percentile(finite / 10.0**exponent, [cfg.p_lo, cfg.p_hi])
+    # A flat curve gets a range too, wide enough for the labels of its axis to differ.
+    padding = cfg.pad * max(high - low, 0.4 * abs(high), 0.4 * abs(low), cfg.min_span)
+    return exponent, float(low - padding), float(high + padding)

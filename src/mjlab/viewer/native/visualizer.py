@@ -12,8 +12,6 @@ from mjlab.viewer.model_sync import compute_poses
 
 log = logging.getLogger(__name__)
 
-_NO_PERTURBATION = mujoco.MjvPerturb()
-
 
 class MujocoNativeDebugVisualizer(DebugVisualizer):
     """Appends what terms draw to the geoms of a MuJoCo scene.
@@ -117,25 +115,10 @@ class MujocoNativeDebugVisualizer(DebugVisualizer):
         if first >= self.scn.maxgeom:
             self._warn_full()
             return
-        mujoco.mjv_addGeoms(
-            model,
-            data,
-            self._ghost_option,
-            _NO_PERTURBATION,
-            int(mujoco.mjtCatBit.mjCAT_DYNAMIC),
-            self.scn,
-        )
+        add_moving_geoms(self.scn, model, data, self._ghost_option)
         for index in range(first, self.scn.ngeom):
             self.scn.geoms[index].rgba[3] = alpha
             self.scn.geoms[index].category = int(mujoco.mjtCatBit.mjCAT_DECOR)
-
-    def _next_geom(self) -> mujoco.MjvGeom | None:
-        if self.scn.ngeom >= self.scn.maxgeom:
-            self._warn_full()
-            return None
-        geom = self.scn.geoms[self.scn.ngeom]
-        self.scn.ngeom += 1
-        return geom
 
     def _warn_full(self) -> None:
         if not self._warned_full:
@@ -154,9 +137,11 @@ class MujocoNativeDebugVisualizer(DebugVisualizer):
         mat: np.ndarray,
         color: Color,
     ) -> None:
-        geom = self._next_geom()
-        if geom is None:
+        if self.scn.ngeom >= self.scn.maxgeom:
+            self._warn_full()
             return
+        geom = self.scn.geoms[self.scn.ngeom]
+        self.scn.ngeom += 1
         mujoco.mjv_initGeom(
             geom,
             int(kind),
@@ -183,3 +168,14 @@ class MujocoNativeDebugVisualizer(DebugVisualizer):
         self._add_geom(kind, np.zeros(3), np.zeros(3), np.eye(3), color)
         if self.scn.ngeom > before:
             mujoco.mjv_connector(self.scn.geoms[before], int(kind), radius, start, end)
+
+
+def add_moving_geoms(
+    scn: mujoco.MjvScene,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    option: mujoco.MjvOption,
+) -> None:
+    """Append the geoms of the moving bodies of `model`, posed by `data`, to a scene."""
+    category = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
+    mujoco.mjv_addGeoms(model, data, option, mujoco.MjvPerturb(), category, scn)

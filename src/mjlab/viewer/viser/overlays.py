@@ -59,7 +59,14 @@ class ViserTermOverlays:
         """Record the terms of the environment in view unless `paused`; show them a few times a
         second."""
         if not paused:
-            self._record()
+            env_idx = self.scene.env_idx
+            rewards = list(self.env.reward_manager.get_active_iterable_terms(env_idx))
+            for panel in (self.reward_bar_panel, self.reward_plotter):
+                if panel is not None:
+                    panel.add(rewards)
+            if self.metrics_plotter is not None:
+                terms = self.env.metrics_manager.get_active_iterable_terms(env_idx)
+                self.metrics_plotter.add(terms)
         now = time.perf_counter()
         if now >= self._next_refresh:
             self._next_refresh = now + _REFRESH_PERIOD_S
@@ -88,16 +95,6 @@ class ViserTermOverlays:
     def _panels(self) -> list[RewardBarPanel | ViserTermPlotter]:
         panels = (self.reward_bar_panel, self.reward_plotter, self.metrics_plotter)
         return [panel for panel in panels if panel is not None]
-
-    def _record(self) -> None:
-        env_idx = self.scene.env_idx
-        rewards = list(self.env.reward_manager.get_active_iterable_terms(env_idx))
-        for panel in (self.reward_bar_panel, self.reward_plotter):
-            if panel is not None:
-                panel.add(rewards)
-        if self.metrics_plotter is not None:
-            terms = self.env.metrics_manager.get_active_iterable_terms(env_idx)
-            self.metrics_plotter.add(terms)
 
 
 @dataclass

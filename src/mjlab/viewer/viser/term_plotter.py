@@ -13,6 +13,7 @@ from mjlab.viewer.base import TermHistory
 
 _SHOWN_AT_FIRST = 6
 _PLOT_HEIGHT = 120
+_EMPTY = (np.zeros(1), np.full(1, np.nan))
 _COLORS = ("#1c7ed6", "#2f9e44", "#e8590c", "#9c36b5", "#0c8599", "#e03131")
 
 
@@ -48,7 +49,20 @@ class ViserTermPlotter:
         with self._folder:
             self._add_selection(term_names)
         for index, term in enumerate(term_names):
-            self._plots[term] = self._add_plot(term, _COLORS[index % len(_COLORS)])
+            color = _COLORS[index % len(_COLORS)]
+            self._plots[term] = self._gui.add_uplot(
+                _EMPTY,
+                (
+                    uplot.Series(label="steps ago"),
+                    uplot.Series(label=term, stroke=color, width=1.5, points={"show": False}),
+                ),
+                title=term,
+                scales={"x": uplot.Scale(time=False, range=(1 - history_length, 0))},
+                legend=uplot.Legend(show=False),
+                height=_PLOT_HEIGHT,
+                padding=(8, 24, 0, 0),
+                visible=self._boxes[term].value,
+            )
         self.update_env_idx(env_idx)
 
     def update(self, terms: Iterable[tuple[str, Sequence[float]]]) -> None:
@@ -63,8 +77,15 @@ class ViserTermPlotter:
     def refresh(self) -> None:
         """Send the recorded points to the plots that are visible and have changed."""
         for name, plot in self._plots.items():
-            if plot.visible:
-                self._send(name, plot, self.history.values(name))
+            if not plot.visible:
+                continue
+            values = self.history.values(name)
+            if np.array_equal(values, self._sent.get(name, np.zeros(0)), equal_nan=True):
+                continue
+            self._sent[name] = values
+            # The newest point is at 0, older ones at negative numbers of steps.
+            steps = np.arange(1 - len(values), 1, dtype=float)
+            plot.data = (steps, values) if len(values) else _EMPTY
 
     def update_env_idx(self, env_idx: int) -> None:
         """Say that values come from another environment from now on, and forget the others."""
@@ -82,52 +103,25 @@ class ViserTermPlotter:
         self._boxes.clear()
         self._plots.clear()
 
-    def _send(self, name: str, plot: viser.GuiUplotHandle, values: np.ndarray) -> None:
-        if np.array_equal(values, self._sent.get(name, np.zeros(0)), equal_nan=True):
-            return
-        self._sent[name] = values
-        # The newest point is at 0, older ones at negative numbers of steps.
-        steps = np.arange(1 - len(values), 1, dtype=float)
-        plot.data = (steps, values) if len(values) else _EMPTY
-
     def _add_selection(self, names: list[str]) -> None:
         pattern = self._gui.add_text("Filter", "", hint="Show only terms whose name holds this.")
         buttons = self._gui.add_button_group("Select", ["All", "None"])
+
+        def show_chosen() -> None:
+            for name, box in self._boxes.items():
+                box.visible = pattern.value.lower() in name.lower()
+                self._plots[name].visible = box.visible and box.value
+
         for index, name in enumerate(names):
             box = self._gui.add_checkbox(name, index < _SHOWN_AT_FIRST)
-            box.on_update(lambda _: self._filter(pattern.value))
+            box.on_update(lambda _: show_chosen())
             self._boxes[name] = box
 
-        @pattern.on_update
-        def _(_: Any) -> None:
-            self._filter(pattern.value)
+        pattern.on_update(lambda _: show_chosen())
 
         @buttons.on_click
         def _(event: Any) -> None:
             for box in self._boxes.values():
                 if box.visible:
                     box.value = event.target.value == "All"
-            self._filter(pattern.value)
-
-    def _filter(self, pattern: str) -> None:
-        for name, box in self._boxes.items():
-            box.visible = pattern.lower() in name.lower()
-            self._plots[name].visible = box.visible and box.value
-
-    def _add_plot(self, name: str, color: str) -> viser.GuiUplotHandle:
-        return self._gui.add_uplot(
-            _EMPTY,
-            (
-                uplot.Series(label="steps ago"),
-                uplot.Series(label=name, stroke=color, width=1.5, points={"show": False}),
-            ),
-            title=name,
-            scales={"x": uplot.Scale(time=False, range=(1 - self.history.length, 0))},
-            legend=uplot.Legend(show=False),
-            height=_PLOT_HEIGHT,
-            padding=(8, 24, 0, 0),
-            visible=self._boxes[name].value,
-        )
-
-
-_EMPTY = (np.zeros(1), np.full(1, np.nan))
+            show_chosen()

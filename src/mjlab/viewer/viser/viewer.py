@@ -1,4 +1,8 @@
-"""The browser viewer: a page, served from this machine, that shows and controls a running policy."""
+"""The browser viewer: a page, served from this machine, that shows and controls a running policy.
+
+`ViserPlayViewer` is the viewer. Its Controls tab has the status and the buttons of `SimulationControls`,
+its Checkpoints tab the `CheckpointPanel` of a `CheckpointManager`.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 import viser
 
+from mjlab.utils.errors import WrongStateError
 from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction, ViewerStatus, forget
 from mjlab.viewer.camera import resolve_camera
 from mjlab.viewer.page_server import DEFAULT_HOST as DEFAULT_HOST
@@ -33,78 +38,11 @@ if TYPE_CHECKING:
     from mjlab.viewer.base import EnvProtocol, PolicyProtocol
 
 
-# MERGED mjlab.viewer.viser.viewer: Status and the buttons that run, pause, step and reset.
-
-_SPEED_ACTIONS = {"Slower": "speed_down", "1x": "reset_speed", "Faster": "speed_up"}
-
-
-class SimulationControls:
-    """The Info and Simulation parts of the Controls tab."""
-
-    def __init__(self, server: viser.ViserServer, request_action: Callable[..., None]) -> None:
-        """Add the controls to the current place in the page.
-
-        Args:
-            server: The page's server.
-            request_action: Queues a viewer action by name for the main thread.
-        """
-        gui = server.gui
-        with gui.add_folder("Info"):
-            self._status = gui.add_html("")
-        self._shown = ""
-        with gui.add_folder("Simulation"):
-            self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
-            self._step = gui.add_button(
-                "Step",
-                icon=viser.Icon.PLAYER_TRACK_NEXT,
-                disabled=True,
-                hint="One environment step, while paused.",
-            )
-            reset = gui.add_button("Reset Environment", icon=viser.Icon.REFRESH)
-            speed = gui.add_button_group("Speed", list(_SPEED_ACTIONS))
-        self._pause.on_click(lambda _: request_action("toggle_pause"))
-        self._step.on_click(lambda _: request_action("single_step"))
-        reset.on_click(lambda _: request_action("reset"))
-
-        @speed.on_click
-        def _(event: Any) -> None:
-            request_action(_SPEED_ACTIONS[event.target.value])
-
-    def show_paused(self, paused: bool) -> None:
-        """Let the buttons say what they now do."""
-        self._pause.label = "Play" if paused else "Pause"
-        self._pause.icon = viser.Icon.PLAYER_PLAY if paused else viser.Icon.PLAYER_PAUSE
-        self._step.disabled = not paused
-
-    def show_status(self, status: ViewerStatus) -> None:
-        """Show the status where it differs from what is shown."""
-        content = status_html(status)
-        if content != self._shown:
-            self._shown = self._status.content = content
-
-
-def status_html(status: ViewerStatus) -> str:
-    """The status as a small table."""
-    state = "Paused" if status.paused else "Running"
-    if status.capped and not status.paused:
-        state += ' <span style="color:#e03131">CAPPED</span>'
-    actual = "—" if status.actual_realtime <= 0 else f"{status.actual_realtime:.2f}x"
-    rows = [
-        ("Status", state),
-        ("Steps", f"{status.step_count:,}"),
-        ("Speed", status.speed_label),
-        ("Real time", f"{actual} of {status.target_realtime:g}x ({status.smoothed_fps:.0f} FPS)"),
-    ]
-    if status.last_error is not None:
-        error = html.escape(status.last_error)
-        rows.append(("Error", f'<span style="color:#e03131">{error}</span>'))
-    lines = "".join(f"<div><strong>{name}:</strong> {value}</div>" for name, value in rows)
-    return f'<div style="padding:0.25em 1em;font-size:0.85em;line-height:1.5">{lines}</div>'
-
-
-# MERGED mjlab.viewer.viser.viewer: Choosing another checkpoint while the viewer runs.
-
 log = logging.getLogger(__name__)
+
+# Wall time from one look at the status to the next, in seconds.
+_PANEL_PERIOD_S = 0.2
+_SPEED_ACTIONS = {"Slower": "speed_down", "1x": "reset_speed", "Faster": "speed_up"}
 _NONE_FOUND = "(none)"
 
 
@@ -125,144 +63,6 @@ class CheckpointManager:
     """Address of the run's page."""
     run_status: str | None = None
     """Status of the run."""
-
-
-def local_checkpoints(
-    folder: Path, load_policy: Callable[[Path], PolicyProtocol], current: str = ""
-) -> CheckpointManager:
-    """Return a manager of the checkpoints (`*.pt`) in `folder`; `current` is the one in use."""
-
-    def fetch_available() -> list[tuple[str, str]]:
-        # The replay beside a checkpoint has no policy.
-        files = [path for path in folder.glob("*.pt") if not path.name.startswith("replay_")]
-        files.sort(key=lambda path: checkpoint_number(path.name))
-        now = time.time()
-        return [(file.name, format_time_ago(int(now - file.stat().st_mtime))) for file in files]
-
-    return CheckpointManager(
-        current_name=current,
-        fetch_available=fetch_available,
-        load_checkpoint=lambda name: load_policy(folder / name),
-        run_name=str(folder),
-    )
-
-
-def checkpoint_number(name: str) -> int:
-    """Return the number after the first underscore of a checkpoint's name, or 0."""
-    match = re.match(r"[^_]*_(\d+)", name)
-    return int(match.group(1)) if match else 0
-
-
-def format_time_ago(seconds: int) -> str:
-    """Return a time span as `12s ago`, `5m ago`, `2h ago` or `3d ago`."""
-    for unit, length in (("d", 86400), ("h", 3600), ("m", 60)):
-        if seconds >= length:
-            return f"{int(seconds // length)}{unit} ago"
-    return f"{max(int(seconds), 0)}s ago"
-
-
-class CheckpointPanel:
-    """List, Sync and Use Latest. What goes wrong is shown here and ends nothing."""
-
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        manager: CheckpointManager,
-        request_load: Callable[[str], None],
-    ):
-        """Add the panel to the current place in the page and list what there is.
-
-        Args:
-            server: The page's server.
-            manager: Lists and loads checkpoints.
-            request_load: Asks the main thread to load a checkpoint by name.
-        """
-        self._manager = manager
-        self._request_load = request_load
-        self._labels: dict[str, str] = {}
-        # Setting the list's value calls its callback, as a person's choice does.
-        self._silent = threading.local()
-        gui = server.gui
-        self._about = gui.add_markdown("")
-        self._choice = gui.add_dropdown("Checkpoint", [_NONE_FOUND])
-        self._message = gui.add_html("")
-        latest = gui.add_button("Use Latest", icon=viser.Icon.PLAYER_TRACK_NEXT)
-        sync = gui.add_button("Sync", icon=viser.Icon.REFRESH, hint="Look for new checkpoints.")
-        self._choice.on_update(self._chosen)
-        latest.on_click(lambda _: self._use_latest())
-        sync.on_click(lambda _: self.refresh())
-        self.refresh()
-        self.select(manager.current_name)
-
-    def refresh(self) -> None:
-        """List the source again, keeping the choice where it still exists."""
-        try:
-            checkpoints = self._manager.fetch_available()
-        except Exception as error:
-            log.exception("Cannot list checkpoints.")
-            self.show_error(f"Cannot list checkpoints: {error}")
-            return
-        self._about.content = _describe(self._manager)
-        chosen = self._labels.get(self._choice.value)
-        # The newest first: that is the one people look for.
-        self._labels = {
-            f"{name} ({age})" if age else name: name for name, age in reversed(checkpoints)
-        }
-        self._quietly("options", list(self._labels) or [_NONE_FOUND])
-        self.select(chosen or self._manager.current_name)
-        self._show(f"{len(checkpoints)} found.")
-
-    def select(self, name: str) -> None:
-        """Show `name` as the chosen one, without loading it."""
-        for label, candidate in self._labels.items():
-            if candidate == name:
-                self._quietly("value", label)
-
-    def show_loaded(self, name: str) -> None:
-        """Say that `name` is in use."""
-        self._manager.current_name = name
-        self.select(name)
-        self._show(f"Loaded {name}.")
-
-    def show_error(self, message: str) -> None:
-        """Say what went wrong."""
-        self._show(message, color="#e03131")
-
-    def _show(self, message: str, color: str = "inherit") -> None:
-        self._message.content = (
-            f'<div style="padding:0 1em;font-size:0.85em;color:{color}">'
-            f"{html.escape(message)}</div>"
-        )
-
-    def _quietly(self, attribute: str, value: Any) -> None:
-        self._silent.on = True
-        try:
-            setattr(self._choice, attribute, value)
-        finally:
-            self._silent.on = False
-
-    def _chosen(self, _: Any) -> None:
-        name = self._labels.get(self._choice.value)
-        if name is not None and not getattr(self._silent, "on", False):
-            self._request_load(name)
-
-    def _use_latest(self) -> None:
-        self.refresh()
-        if self._labels:
-            self._request_load(next(iter(self._labels.values())))
-
-
-def _describe(manager: CheckpointManager) -> str:
-    if manager.run_name is None:
-        return "**Local checkpoints**"
-    name = f"`{manager.run_name}`"
-    if manager.run_url is not None:
-        name = f"[{manager.run_name}]({manager.run_url})"
-    status = "" if manager.run_status is None else f" ({manager.run_status})"
-    return f"**Run:** {name}{status}"
-
-
-_PANEL_PERIOD_S = 0.2
 
 
 class UpdateReason(enum.Enum):
@@ -346,7 +146,7 @@ class ViserPlayViewer(BaseViewer):
             RuntimeError: `setup` has not been called.
         """
         if self._scene is None:
-            raise RuntimeError(
+            raise WrongStateError(
                 "The viewer's scene does not exist yet; call setup() or run() first."
             )
         return self._scene
@@ -374,7 +174,9 @@ class ViserPlayViewer(BaseViewer):
         )
         self._debug_overlays = ViserDebugOverlays(env, scene)
         self._contact_overlays = ViserContactOverlays(scene)
-        self._bind_drawn_fields()
+        # Reading a field has the engine provide it.
+        for name in ("xpos", "xmat", *(("mocap_pos", "mocap_quat") if model.nmocap > 0 else ())):
+            getattr(env.sim.data, name)
         self._create_gui()
         log.debug("The viewer is at %s", self.url)
 
@@ -400,7 +202,12 @@ class ViserPlayViewer(BaseViewer):
             self._next_scene = now + self.scene_period
             # Requests from here on may come too late for this drawing, and cause another.
             self._update_reasons.clear()
-            self._draw_scene()
+            env, scene = self.env.unwrapped, self.scene
+            if self._debug_overlays is not None:
+                self._debug_overlays.queue()
+            scene.update(env.sim, self._shown_env)
+            if self._camera_overlays is not None and self._camera_overlays.has_cameras:
+                self._camera_overlays.update(env.sim.data, self._shown_env, scene.offset)
         if self._term_overlays is not None:
             self._term_overlays.update(paused=True)
         if self._controls is not None and now >= self._next_panels:
@@ -433,15 +240,14 @@ class ViserPlayViewer(BaseViewer):
             return True
         return False
 
-    def _bind_drawn_fields(self) -> None:
-        """Have the engine provide what the scene reads."""
-        sim = self.env.unwrapped.sim
-        for name in ("xpos", "xmat", "mocap_pos", "mocap_quat"):
-            if not name.startswith("mocap") or sim.mj_model.nmocap > 0:
-                getattr(sim.data, name)
-
     def _create_gui(self) -> None:
         gui, scene = self._server.gui, self.scene
+
+        def add_debug_vis_switches() -> None:
+            env = self.env.unwrapped
+            for part in (*env.manager_visualizers.values(), env.sensor_visualizers):
+                part.create_debug_vis_gui(self._server, scene.request_update)
+
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Controls", icon=viser.Icon.SETTINGS):
@@ -449,7 +255,7 @@ class ViserPlayViewer(BaseViewer):
             self._controls = SimulationControls(self._server, self.request_action)
             self._add_command_panels()
             with gui.add_folder("Scene"):
-                scene.create_scene_gui(debug_viz_extra_gui=self._add_debug_vis_switches)
+                scene.create_scene_gui(debug_viz_extra_gui=add_debug_vis_switches)
             if self._camera_overlays is not None:
                 self._camera_overlays.setup_controls()
         with tabs.add_tab("Visualization", icon=viser.Icon.EYE):
@@ -478,19 +284,6 @@ class ViserPlayViewer(BaseViewer):
             )
         if not folder._children:
             folder.remove()
-
-    def _add_debug_vis_switches(self) -> None:
-        env = self.env.unwrapped
-        for part in (*env.manager_visualizers.values(), env.sensor_visualizers):
-            part.create_debug_vis_gui(self._server, self.scene.request_update)
-
-    def _draw_scene(self) -> None:
-        env, scene = self.env.unwrapped, self.scene
-        if self._debug_overlays is not None:
-            self._debug_overlays.queue()
-        scene.update(env.sim, self._shown_env)
-        if self._camera_overlays is not None and self._camera_overlays.has_cameras:
-            self._camera_overlays.update(env.sim.data, self._shown_env, scene.offset)
 
     def _follow_env_switch(self) -> None:
         """Start plots and drawings over if the page selected another environment."""
@@ -533,3 +326,200 @@ class ViserPlayViewer(BaseViewer):
                 env.obs_buf = env.observation_manager.compute(update_history=True, env_ids=ids)
             forget(self.policy, torch.zeros(env.num_envs, device=env.device).index_fill_(0, ids, 1))
         self.after_reset()
+
+
+class SimulationControls:
+    """The Info and Simulation parts of the Controls tab."""
+
+    def __init__(self, server: viser.ViserServer, request_action: Callable[..., None]) -> None:
+        """Add the controls to the current place in the page.
+
+        Args:
+            server: The page's server.
+            request_action: Queues a viewer action by name for the main thread.
+        """
+        gui = server.gui
+        with gui.add_folder("Info"):
+            self._status = gui.add_html("")
+        self._shown = ""
+        with gui.add_folder("Simulation"):
+            self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
+            self._step = gui.add_button(
+                "Step",
+                icon=viser.Icon.PLAYER_TRACK_NEXT,
+                disabled=True,
+                hint="One environment step, while paused.",
+            )
+            reset = gui.add_button("Reset Environment", icon=viser.Icon.REFRESH)
+            speed = gui.add_button_group("Speed", list(_SPEED_ACTIONS))
+        self._pause.on_click(lambda _: request_action("toggle_pause"))
+        self._step.on_click(lambda _: request_action("single_step"))
+        reset.on_click(lambda _: request_action("reset"))
+
+        @speed.on_click
+        def _(event: Any) -> None:
+            request_action(_SPEED_ACTIONS[event.target.value])
+
+    def show_paused(self, paused: bool) -> None:
+        """Let the buttons say what they now do."""
+        self._pause.label = "Play" if paused else "Pause"
+        self._pause.icon = viser.Icon.PLAYER_PLAY if paused else viser.Icon.PLAYER_PAUSE
+        self._step.disabled = not paused
+
+    def show_status(self, status: ViewerStatus) -> None:
+        """Show the status where it differs from what is shown."""
+        content = status_html(status)
+        if content != self._shown:
+            self._shown = self._status.content = content
+
+
+def status_html(status: ViewerStatus) -> str:
+    """The status as a small table."""
+    state = "Paused" if status.paused else "Running"
+    if status.capped and not status.paused:
+        state += ' <span style="color:#e03131">CAPPED</span>'
+    actual = "—" if status.actual_realtime <= 0 else f"{status.actual_realtime:.2f}x"
+    rows = [
+        ("Status", state),
+        ("Steps", f"{status.step_count:,}"),
+        ("Speed", status.speed_label),
+        ("Real time", f"{actual} of {status.target_realtime:g}x ({status.smoothed_fps:.0f} FPS)"),
+    ]
+    if status.last_error is not None:
+        error = html.escape(status.last_error)
+        rows.append(("Error", f'<span style="color:#e03131">{error}</span>'))
+    lines = "".join(f"<div><strong>{name}:</strong> {value}</div>" for name, value in rows)
+    return f'<div style="padding:0.25em 1em;font-size:0.85em;line-height:1.5">{lines}</div>'
+
+
+class CheckpointPanel:
+    """List, Sync and Use Latest. What goes wrong is shown here and ends nothing."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        manager: CheckpointManager,
+        request_load: Callable[[str], None],
+    ):
+        """Add the panel to the current place in the page and list what there is.
+
+        Args:
+            server: The page's server.
+            manager: Lists and loads checkpoints.
+            request_load: Asks the main thread to load a checkpoint by name.
+        """
+        self._manager = manager
+        self._request_load = request_load
+        self._labels: dict[str, str] = {}
+        # Setting the list's value calls its callback, as a person's choice does.
+        self._silent = threading.local()
+        gui = server.gui
+        self._about = gui.add_markdown("")
+        self._choice = gui.add_dropdown("Checkpoint", [_NONE_FOUND])
+        self._message = gui.add_html("")
+        latest = gui.add_button("Use Latest", icon=viser.Icon.PLAYER_TRACK_NEXT)
+        sync = gui.add_button("Sync", icon=viser.Icon.REFRESH, hint="Look for new checkpoints.")
+        self._choice.on_update(self._chosen)
+        latest.on_click(lambda _: self.load_latest())
+        sync.on_click(lambda _: self.refresh())
+        self.refresh()
+        self.select(manager.current_name)
+
+    def refresh(self) -> None:
+        """List the source again, keeping the choice where it still exists."""
+        try:
+            checkpoints = self._manager.fetch_available()
+        except Exception as error:
+            log.exception("Cannot list checkpoints.")
+            self.show_error(f"Cannot list checkpoints: {error}")
+            return
+        self._about.content = "**Local checkpoints**"
+        if self._manager.run_name is not None:
+            name, status = f"`{self._manager.run_name}`", ""
+            if self._manager.run_url is not None:
+                name = f"[{self._manager.run_name}]({self._manager.run_url})"
+            if self._manager.run_status is not None:
+                status = f" ({self._manager.run_status})"
+            self._about.content = f"**Run:** {name}{status}"
+        chosen = self._labels.get(self._choice.value)
+        # The newest first: that is the one people look for.
+        self._labels = {
+            f"{name} ({age})" if age else name: name for name, age in reversed(checkpoints)
+        }
+        self._quietly("options", list(self._labels) or [_NONE_FOUND])
+        self.select(chosen or self._manager.current_name)
+        self._show(f"{len(checkpoints)} found.")
+
+    def select(self, name: str) -> None:
+        """Show `name` as the chosen one, without loading it."""
+        for label, candidate in self._labels.items():
+            if candidate == name:
+                self._quietly("value", label)
+
+    def show_loaded(self, name: str) -> None:
+        """Say that `name` is in use."""
+        self._manager.current_name = name
+        self.select(name)
+        self._show(f"Loaded {name}.")
+
+    def show_error(self, message: str) -> None:
+        """Say what went wrong."""
+        self._show(message, color="#e03131")
+
+    def load_latest(self) -> None:
+        """List the source again and load the newest checkpoint."""
+        self.refresh()
+        if self._labels:
+            self._request_load(next(iter(self._labels.values())))
+
+    def _show(self, message: str, color: str = "inherit") -> None:
+        self._message.content = (
+            f'<div style="padding:0 1em;font-size:0.85em;color:{color}">'
+            f"{html.escape(message)}</div>"
+        )
+
+    def _quietly(self, attribute: str, value: Any) -> None:
+        self._silent.on = True
+        try:
+            setattr(self._choice, attribute, value)
+        finally:
+            self._silent.on = False
+
+    def _chosen(self, _: Any) -> None:
+        name = self._labels.get(self._choice.value)
+        if name is not None and not getattr(self._silent, "on", False):
+            self._request_load(name)
+
+
+def local_checkpoints(
+    folder: Path, load_policy: Callable[[Path], PolicyProtocol], current: str = ""
+) -> CheckpointManager:
+    """Return a manager of the checkpoints (`*.pt`) in `folder`; `current` is the one in use."""
+
+    def fetch_available() -> list[tuple[str, str]]:
+        # The replay beside a checkpoint has no policy.
+        files = [path for path in folder.glob("*.pt") if not path.name.startswith("replay_")]
+        files.sort(key=lambda path: checkpoint_number(path.name))
+        now = time.time()
+        return [(file.name, format_time_ago(int(now - file.stat().st_mtime))) for file in files]
+
+    return CheckpointManager(
+        current_name=current,
+        fetch_available=fetch_available,
+        load_checkpoint=lambda name: load_policy(folder / name),
+        run_name=str(folder),
+    )
+
+
+def checkpoint_number(name: str) -> int:
+    """Return the number after the first underscore of a checkpoint's name, or 0."""
+    match = re.match(r"[^_]*_(\d+)", name)
+    return int(match.group(1)) if match else 0
+
+
+def format_time_ago(seconds: int) -> str:
+    """Return a time span as `12s ago`, `5m ago`, `2h ago` or `3d ago`."""
+    for unit, length in (("d", 86400), ("h", 3600), ("m", 60)):
+        if seconds >= length:
+            return f"{int(seconds // length)}{unit} ago"
+    return f"{max(int(seconds), 0)}s ago"

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Debug drawing in the browser: primitives of one kind are sent as one batch."""
 
 from __future__ import annotations
 
@@ -15,21 +15,199 @@ from mjviser.conversions import is_fixed_body, merge_geoms
 from mjlab.viewer.debug_visualizer import MIN_LENGTH, Color, DebugVisualizer, pose_ghost
 from mjlab.viewer.model_sync import compute_poses, to_numpy
 
-# MERGED mjlab.viewer.viser.visualizer: Debug drawing in the browser: primitives of one kind are sent as one batch.
-
 Array = np.ndarray | torch.Tensor
+
 _HEAD_FRACTION = 0.2
 _HEAD_WIDENING = 2.0
 _MAX_GHOST_GEOM_GROUP = 2
 
 
-def _unit_meshes() -> dict[str, trimesh.Trimesh]:
-    return {
-        "shaft": trimesh.creation.cylinder(radius=1.0, height=1.0, sections=16),
-        "head": trimesh.creation.cone(radius=1.0, height=1.0, sections=16),
-        "sphere": trimesh.creation.icosphere(subdivisions=2, radius=1.0),
-        "box": trimesh.creation.box(extents=(2.0, 2.0, 2.0)),
-    }
+class ViserDebugVisualizer(DebugVisualizer):
+    """Collects what terms draw in a frame; `send` shows it in the browser.
+
+    Each item keeps its own opacity, arrows included.
+    """
+
+    def __init__(self, server: viser.ViserServer, model: mujoco.MjModel):
+        self._server = server
+        self._model = model
+        self._meshes = {
+            "shaft": trimesh.creation.cylinder(radius=1.0, height=1.0, sections=16),
+            "head": trimesh.creation.cone(radius=1.0, height=1.0, sections=16),
+            "sphere": trimesh.creation.icosphere(subdivisions=2, radius=1.0),
+            "box": trimesh.creation.box(extents=(2.0, 2.0, 2.0)),
+        }
+        self._batches: dict[str, _Batch] = {}
+        self._arrows = _Arrows()
+        self._debug_handles: dict[str, viser.BatchedMeshHandle] = {}
+        self._ghosts: dict[int, tuple[mujoco.MjModel, mujoco.MjData, dict[int, str]]] = {}
+
+    @property
+    def meansize(self) -> float:
+        return float(self._model.stat.meansize)
+
+    def clear(self) -> None:
+        self._batches.clear()
+        self._arrows = _Arrows()
+
+    def clear_debug_all(self) -> None:
+        """Remove everything drawn, from the page too."""
+        self.clear()
+        for handle in self._debug_handles.values():
+            handle.remove()
+        self._debug_handles.clear()
+
+    def add_arrow(
+        self,
+        start: Array,
+        end: Array,
+        color: Color,
+        width: float = 0.015,
+        label: str | None = None,
+    ) -> None:
+        arrows = self._arrows
+        arrows.starts.append(np.array(to_numpy(start), dtype=float))
+        arrows.ends.append(np.array(to_numpy(end), dtype=float))
+        arrows.widths.append(width)
+        arrows.colors.append(color)
+
+    def add_cylinder(
+        self,
+        start: Array,
+        end: Array,
+        radius: float,
+        color: Color,
+        label: str | None = None,
+    ) -> None:
+        start, end = to_numpy(start).reshape(3), to_numpy(end).reshape(3)
+        vector = end.astype(float) - start
+        length = float(np.linalg.norm(vector))
+        if length >= MIN_LENGTH:
+            [wxyz] = rotations_of_z(vector[None] / length)
+            self._add("shaft", start + 0.5 * vector, wxyz, (radius, radius, length), color)
+
+    def add_sphere(
+        self, center: Array, radius: float, color: Color, label: str | None = None
+    ) -> None:
+        self._add("sphere", center, (1.0, 0.0, 0.0, 0.0), (radius, radius, radius), color)
+
+    def add_ellipsoid(
+        self,
+        center: Array,
+        size: Array,
+        mat: Array,
+        color: Color,
+        label: str | None = None,
+    ) -> None:
+        self._add("sphere", center, _wxyz(mat), size, color)
+
+    def add_box(
+        self,
+        center: Array,
+        size: Array,
+        mat: Array,
+        color: Color,
+        label: str | None = None,
+    ) -> None:
+        self._add("box", center, _wxyz(mat), size, color)
+
+    def add_ghost_mesh(
+        self,
+        qpos: Array,
+        model: mujoco.MjModel,
+        mocap_pos: Array | None = None,
+        mocap_quat: Array | None = None,
+        alpha: float = 0.5,
+        label: str | None = None,
+    ) -> None:
+        if id(model) not in self._ghosts:
+            shown = {
+                geom_id: f"ghost/{id(model)}/{geom_id}"
+                for geom_id in range(model.ngeom)
+                if model.geom_group[geom_id] <= _MAX_GHOST_GEOM_GROUP
+                and _geom_rgba(model, geom_id)[3] > 0
+                and not is_fixed_body(model, int(model.geom_bodyid[geom_id]))
+            }
+            for geom_id, key in shown.items():
+                self._meshes[key] = merge_geoms(model, [geom_id])
+            # The model is kept too, so that its id cannot be reused by another model.
+            self._ghosts[id(model)] = (model, mujoco.MjData(model), shown)
+        _, data, shown = self._ghosts[id(model)]
+        mocap = (None if pose is None else to_numpy(pose) for pose in (mocap_pos, mocap_quat))
+        pose_ghost(data, to_numpy(qpos), *mocap)
+        compute_poses(model, data)
+        for geom_id, key in shown.items():
+            body_id = model.geom_bodyid[geom_id]
+            red, green, blue, _ = _geom_rgba(model, geom_id)
+            self._add(
+                key,
+                data.xpos[body_id],
+                data.xquat[body_id],
+                (1.0, 1.0, 1.0),
+                (red, green, blue, alpha),
+            )
+
+    def add_frame(
+        self,
+        position: Array,
+        rotation_matrix: Array,
+        scale: float = 0.3,
+        label: str | None = None,
+        axis_radius: float = 0.01,
+        alpha: float = 1.0,
+        axis_colors: tuple[tuple[float, float, float], ...] | None = None,
+    ) -> None:
+        position, rotation = to_numpy(position), to_numpy(rotation_matrix)
+        super().add_frame(position, rotation, scale, label, axis_radius, alpha, axis_colors)
+
+    def send(self, offset: np.ndarray) -> None:
+        """Show this frame's items, moved by `offset` (3,), and hide what was not drawn again."""
+        arrows, self._arrows = self._arrows, _Arrows()
+        if arrows.starts:
+            shafts, heads = (self._batches.get(key, _Batch()) for key in ("shaft", "head"))
+            arrows.add_to(shafts, heads)
+            if heads.positions:
+                self._batches["shaft"], self._batches["head"] = shafts, heads
+        for key, batch in self._batches.items():
+            self._send_batch(key, batch, offset)
+        for key, handle in self._debug_handles.items():
+            if key not in self._batches and handle.visible:
+                handle.visible = False
+
+    def _add(self, key: str, position, wxyz, scale, color: Color) -> None:
+        self._batches.setdefault(key, _Batch()).add(position, wxyz, scale, color)
+
+    def _send_batch(self, key: str, batch: _Batch, offset: np.ndarray) -> None:
+        positions = np.array(batch.positions, dtype=np.float32).reshape(-1, 3)
+        positions += np.asarray(offset, dtype=np.float32)
+        wxyzs = np.array(batch.wxyzs, dtype=np.float32).reshape(-1, 4)
+        scales = np.array(batch.scales, dtype=np.float32).reshape(-1, 3)
+        rgba = np.clip(np.array(batch.colors, dtype=np.float32), 0.0, 1.0)
+        colors = (rgba[:, :3] * 255).astype(np.uint8)
+        handle = self._debug_handles.get(key)
+        if handle is None:
+            mesh = self._meshes[key]
+            self._debug_handles[key] = self._server.scene.add_batched_meshes_simple(
+                f"/debug/{key}",
+                np.asarray(mesh.vertices, dtype=np.float32),
+                np.asarray(mesh.faces, dtype=np.uint32),
+                batched_wxyzs=wxyzs,
+                batched_positions=positions,
+                batched_scales=scales,
+                batched_colors=colors,
+                batched_opacities=rgba[:, 3],
+                lod="off",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            return
+        handle.batched_positions = positions
+        handle.batched_wxyzs = wxyzs
+        handle.batched_scales = scales
+        handle.batched_colors = colors
+        handle.batched_opacities = rgba[:, 3]
+        if not handle.visible:
+            handle.visible = True
 
 
 @dataclass
@@ -72,7 +250,7 @@ class _Arrows:
         kept = np.flatnonzero(lengths >= MIN_LENGTH)
         starts, lengths = starts[kept], lengths[kept, None]
         axes = vectors[kept] / lengths
-        wxyzs = _rotations_of_z(axes)
+        wxyzs = rotations_of_z(axes)
         widths = np.array(self.widths, dtype=float)[kept, None]
         colors = [self.colors[i] for i in kept]
         shaft, head = (1.0 - _HEAD_FRACTION) * lengths, _HEAD_FRACTION * lengths
@@ -81,200 +259,6 @@ class _Arrows:
         )
         radii = _HEAD_WIDENING * widths
         heads.extend(starts + shaft * axes, wxyzs, np.hstack((radii, radii, head)), colors)
-
-
-class ViserDebugVisualizer(DebugVisualizer):
-    """Collects what terms draw in a frame; `send` shows it in the browser.
-
-    Each item keeps its own opacity, arrows included.
-    """
-
-    def __init__(self, server: viser.ViserServer, model: mujoco.MjModel):
-        self._server = server
-        self._model = model
-        self._meshes = _unit_meshes()
-        self._batches: dict[str, _Batch] = {}
-        self._arrows = _Arrows()
-        self._debug_handles: dict[str, viser.BatchedMeshHandle] = {}
-        self._ghosts: dict[int, tuple[mujoco.MjModel, mujoco.MjData, list[int]]] = {}
-
-    @property
-    def meansize(self) -> float:
-        return float(self._model.stat.meansize)
-
-    def clear(self) -> None:
-        self._batches.clear()
-        self._arrows = _Arrows()
-
-    def clear_debug_all(self) -> None:
-        """Remove everything drawn, from the page too."""
-        self.clear()
-        for handle in self._debug_handles.values():
-            handle.remove()
-        self._debug_handles.clear()
-
-    def add_arrow(
-        self,
-        start: Array,
-        end: Array,
-        color: Color,
-        width: float = 0.015,
-        label: str | None = None,
-    ) -> None:
-        arrows = self._arrows
-        arrows.starts.append(np.array(to_numpy(start), dtype=float))
-        arrows.ends.append(np.array(to_numpy(end), dtype=float))
-        arrows.widths.append(width)
-        arrows.colors.append(color)
-
-    def add_cylinder(
-        self,
-        start: Array,
-        end: Array,
-        radius: float,
-        color: Color,
-        label: str | None = None,
-    ) -> None:
-        start, end = to_numpy(start).reshape(3), to_numpy(end).reshape(3)
-        length, wxyz, axis = _direction(start, end)
-        if length >= MIN_LENGTH:
-            middle = start + 0.5 * length * axis
-            self._add("shaft", middle, wxyz, (radius, radius, length), color)
-
-    def add_sphere(
-        self, center: Array, radius: float, color: Color, label: str | None = None
-    ) -> None:
-        self._add("sphere", center, (1.0, 0.0, 0.0, 0.0), (radius, radius, radius), color)
-
-    def add_ellipsoid(
-        self,
-        center: Array,
-        size: Array,
-        mat: Array,
-        color: Color,
-        label: str | None = None,
-    ) -> None:
-        self._add("sphere", center, _wxyz(mat), size, color)
-
-    def add_box(
-        self,
-        center: Array,
-        size: Array,
-        mat: Array,
-        color: Color,
-        label: str | None = None,
-    ) -> None:
-        self._add("box", center, _wxyz(mat), size, color)
-
-    def add_ghost_mesh(
-        self,
-        qpos: Array,
-        model: mujoco.MjModel,
-        mocap_pos: Array | None = None,
-        mocap_quat: Array | None = None,
-        alpha: float = 0.5,
-        label: str | None = None,
-    ) -> None:
-        if id(model) not in self._ghosts:
-            # The model is kept too, so that its id cannot be reused by another model.
-            self._ghosts[id(model)] = (model, mujoco.MjData(model), self._ghost_meshes(model))
-        _, data, geom_ids = self._ghosts[id(model)]
-        mocap = (None if pose is None else to_numpy(pose) for pose in (mocap_pos, mocap_quat))
-        pose_ghost(data, to_numpy(qpos), *mocap)
-        compute_poses(model, data)
-        for geom_id in geom_ids:
-            body_id = model.geom_bodyid[geom_id]
-            red, green, blue, _ = _geom_rgba(model, geom_id)
-            self._add(
-                _ghost_key(model, geom_id),
-                data.xpos[body_id],
-                data.xquat[body_id],
-                (1.0, 1.0, 1.0),
-                (red, green, blue, alpha),
-            )
-
-    def add_frame(
-        self,
-        position: Array,
-        rotation_matrix: Array,
-        scale: float = 0.3,
-        label: str | None = None,
-        axis_radius: float = 0.01,
-        alpha: float = 1.0,
-        axis_colors: tuple[tuple[float, float, float], ...] | None = None,
-    ) -> None:
-        position, rotation = to_numpy(position), to_numpy(rotation_matrix)
-        super().add_frame(position, rotation, scale, label, axis_radius, alpha, axis_colors)
-
-    def send(self, offset: np.ndarray) -> None:
-        """Show this frame's items, moved by `offset` (3,), and hide what was not drawn again."""
-        self._batch_arrows()
-        for key, batch in self._batches.items():
-            self._send_batch(key, batch, offset)
-        for key, handle in self._debug_handles.items():
-            if key not in self._batches and handle.visible:
-                handle.visible = False
-
-    def _ghost_meshes(self, model: mujoco.MjModel) -> list[int]:
-        """Make the meshes of the geoms of `model` that a ghost shows; return the geoms' ids."""
-        geom_ids = [
-            geom_id
-            for geom_id in range(model.ngeom)
-            if model.geom_group[geom_id] <= _MAX_GHOST_GEOM_GROUP
-            and _geom_rgba(model, geom_id)[3] > 0
-            and not is_fixed_body(model, int(model.geom_bodyid[geom_id]))
-        ]
-        for geom_id in geom_ids:
-            self._meshes[_ghost_key(model, geom_id)] = merge_geoms(model, [geom_id])
-        return geom_ids
-
-    def _batch_arrows(self) -> None:
-        arrows, self._arrows = self._arrows, _Arrows()
-        if not arrows.starts:
-            return
-        shafts, heads = (self._batches.get(key, _Batch()) for key in ("shaft", "head"))
-        arrows.add_to(shafts, heads)
-        if heads.positions:
-            self._batches["shaft"], self._batches["head"] = shafts, heads
-
-    def _add(self, key: str, position, wxyz, scale, color: Color) -> None:
-        self._batches.setdefault(key, _Batch()).add(position, wxyz, scale, color)
-
-    def _send_batch(self, key: str, batch: _Batch, offset: np.ndarray) -> None:
-        positions = np.array(batch.positions, dtype=np.float32).reshape(-1, 3)
-        positions += np.asarray(offset, dtype=np.float32)
-        wxyzs = np.array(batch.wxyzs, dtype=np.float32).reshape(-1, 4)
-        scales = np.array(batch.scales, dtype=np.float32).reshape(-1, 3)
-        rgba = np.clip(np.array(batch.colors, dtype=np.float32), 0.0, 1.0)
-        colors = (rgba[:, :3] * 255).astype(np.uint8)
-        handle = self._debug_handles.get(key)
-        if handle is None:
-            mesh = self._meshes[key]
-            self._debug_handles[key] = self._server.scene.add_batched_meshes_simple(
-                f"/debug/{key}",
-                np.asarray(mesh.vertices, dtype=np.float32),
-                np.asarray(mesh.faces, dtype=np.uint32),
-                batched_wxyzs=wxyzs,
-                batched_positions=positions,
-                batched_scales=scales,
-                batched_colors=colors,
-                batched_opacities=rgba[:, 3],
-                lod="off",
-                cast_shadow=False,
-                receive_shadow=False,
-            )
-            return
-        handle.batched_positions = positions
-        handle.batched_wxyzs = wxyzs
-        handle.batched_scales = scales
-        handle.batched_colors = colors
-        handle.batched_opacities = rgba[:, 3]
-        if not handle.visible:
-            handle.visible = True
-
-
-def _ghost_key(model: mujoco.MjModel, geom_id: int) -> str:
-    return f"ghost/{id(model)}/{geom_id}"
 
 
 def _geom_rgba(model: mujoco.MjModel, geom_id: int) -> np.ndarray:
@@ -286,17 +270,7 @@ def _wxyz(mat: Array) -> np.ndarray:
     return vtf.SO3.from_matrix(to_numpy(mat).astype(float).reshape(3, 3)).wxyz
 
 
-def _direction(start: np.ndarray, end: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Length of start to end, a rotation (w, x, y, z) that turns z onto it, and its unit vector."""
-    vector = np.asarray(end, dtype=float).reshape(3) - np.asarray(start, dtype=float).reshape(3)
-    length = float(np.linalg.norm(vector))
-    if length < MIN_LENGTH:
-        return length, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
-    axis = vector / length
-    return length, _rotations_of_z(axis[None])[0], axis
-
-
-def _rotations_of_z(axes: np.ndarray) -> np.ndarray:
+def rotations_of_z(axes: np.ndarray) -> np.ndarray:
     """Rotations (n, 4), w first, that turn z onto unit vectors (n, 3)."""
     # Half way between no turn and twice the turn: 1 + z.a, and z x a.
     wxyzs = np.zeros((len(axes), 4))

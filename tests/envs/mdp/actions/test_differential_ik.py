@@ -568,14 +568,14 @@ def test_the_posture_decides_what_the_position_leaves_open(arm: Any) -> None:
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("frame_type", "camera", "frame_type is 'camera'"),
+        ("frame_type", "camera", "frame_type.*'camera'"),
         ("frame_name", "tip_.*", r"matches 2 sites of entity 'robot': \['tip_1', 'tip_2'\]"),
         ("frame_name", "elbow", "elbow"),
         ("actuator_names", ("finger",), "finger"),
-        ("damping", -0.1, "damping is -0.1"),
-        ("damping", float("nan"), "damping is nan"),
-        ("max_dq", 0.0, "max_dq is 0.0"),
-        ("posture_weight", -1.0, "posture_weight is -1.0"),
+        ("damping", -0.1, "damping.*-0.1"),
+        ("damping", float("nan"), "damping.*nan"),
+        ("max_dq", 0.0, "max_dq.*0.0"),
+        ("posture_weight", -1.0, "posture_weight.*-1.0"),
     ],
 )
 def test_bad_configs_are_refused(arm: Any, field: str, value: Any, message: str) -> None:

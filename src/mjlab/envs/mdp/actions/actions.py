@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,9 +14,6 @@ from mjlab.utils.lab_api.string import resolve_matching_names, resolve_matching_
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
-
-
-# MERGED mjlab.envs.mdp.actions.actions: What the action terms of actuator space share: targets, scale, offset and clip.
 
 
 @dataclass(kw_only=True)
@@ -160,14 +156,12 @@ class BaseAction(ActionTerm):
         bounds = bounds.repeat(self.action_dim, 1)
         ids, names, values = resolve_matching_names_values(self.cfg.clip, self._target_names)
         for i, name, pair in zip(ids, names, values, strict=True):
-            bounds[i] = torch.tensor(_bounds(name, pair), dtype=torch.float32, device=self.device)
+            if len(pair) != 2 or not pair[0] <= pair[1]:
+                raise ValueError(
+                    f"clip of target {name!r} must be (low, high) with low <= high: {pair!r}."
+                )
+            bounds[i] = torch.tensor(pair, dtype=torch.float32, device=self.device)
         return bounds.repeat(self.num_envs, 1, 1)
-
-
-def _bounds(name: str, pair: Sequence[float]) -> tuple[float, float]:
-    if len(pair) != 2 or not pair[0] <= pair[1]:
-        raise ValueError(f"clip of target {name!r} must be (low, high) with low <= high: {pair!r}.")
-    return float(pair[0]), float(pair[1])
 
 
 @dataclass(kw_only=True)
@@ -272,9 +266,6 @@ class JointEffortActionCfg(BaseActionCfg):
 class JointEffortAction(BaseAction):
     """Commands joint efforts (what the actuator's control means: N m or N before its gear)."""
 
-    def __init__(self, cfg: JointEffortActionCfg, env: ManagerBasedRlEnv) -> None:
-        super().__init__(cfg, env)
-
     @constant_within_step
     def apply_actions(self) -> None:
         self._entity.set_joint_effort_target(self._processed_actions, joint_ids=self._columns)
@@ -293,9 +284,6 @@ class TendonLengthActionCfg(BaseActionCfg):
 
 class TendonLengthAction(BaseAction):
     """Commands tendon lengths (m)."""
-
-    def __init__(self, cfg: TendonLengthActionCfg, env: ManagerBasedRlEnv) -> None:
-        super().__init__(cfg, env)
 
     @constant_within_step
     def apply_actions(self) -> None:
@@ -316,9 +304,6 @@ class TendonVelocityActionCfg(BaseActionCfg):
 class TendonVelocityAction(BaseAction):
     """Commands tendon velocities (m/s)."""
 
-    def __init__(self, cfg: TendonVelocityActionCfg, env: ManagerBasedRlEnv) -> None:
-        super().__init__(cfg, env)
-
     @constant_within_step
     def apply_actions(self) -> None:
         self._entity.set_tendon_vel_target(self._processed_actions, tendon_ids=self._columns)
@@ -338,9 +323,6 @@ class TendonEffortActionCfg(BaseActionCfg):
 class TendonEffortAction(BaseAction):
     """Commands tendon forces (N)."""
 
-    def __init__(self, cfg: TendonEffortActionCfg, env: ManagerBasedRlEnv) -> None:
-        super().__init__(cfg, env)
-
     @constant_within_step
     def apply_actions(self) -> None:
         self._entity.set_tendon_effort_target(self._processed_actions, tendon_ids=self._columns)
@@ -359,9 +341,6 @@ class SiteEffortActionCfg(BaseActionCfg):
 
 class SiteEffortAction(BaseAction):
     """Commands efforts at sites, along the first axis of the actuator's gear (N or N m)."""
-
-    def __init__(self, cfg: SiteEffortActionCfg, env: ManagerBasedRlEnv) -> None:
-        super().__init__(cfg, env)
 
     @constant_within_step
     def apply_actions(self) -> None:

@@ -11,43 +11,13 @@ import torch
 
 from mjlab.compat import accepts_older_fields, offers_older_attributes, older_names
 from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
+from mjlab.utils.errors import check_one_of, check_positive
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import compute_pose_error, normalize, quat_box_plus, quat_from_matrix
 from mjlab.utils.string import resolve_expr
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
-
-
-# MERGED mjlab.envs.mdp.actions.differential_ik: Small regularized least-squares problems, one for each environment.
-
-
-def damped_least_squares(
-    jacobian: torch.Tensor, error: torch.Tensor, stiffness: torch.Tensor, pull: torch.Tensor
-) -> torch.Tensor:
-    """Return x = (J'J + D)^-1 (J'e + b), with D a diagonal of positive numbers.
-
-    It is computed as x = D^-1 (b + J'y) with (J D^-1 J' + I) y = e - J D^-1 b (the matrix inversion
-    lemma). That system has the size of the task, not of the arm, its eigenvalues are at least 1,
-    and for an arm that can move freely its condition does not depend on the damping, while that of
-    J'J + D grows with its inverse square: in single precision that fails from a damping of about
-    1e-3 downward. Singular poses still make it ill-conditioned, so it is solved in double
-    precision, which costs no more time here.
-
-    Args:
-        jacobian: J, (N, m, n). error: e, (N, m). stiffness: D, (N, n). pull: b, (N, n).
-
-    Returns (N, n), in the precision of `jacobian`.
-    """
-    j, e = jacobian.double(), error.double().unsqueeze(-1)
-    d, b = stiffness.double().unsqueeze(-1), pull.double().unsqueeze(-1)
-    scaled = j.mT / d
-    system = j @ scaled
-    system.diagonal(dim1=-2, dim2=-1).add_(1.0)
-    # Without a check of the outcome, which would wait for a GPU: the matrix is positive definite.
-    multiplier, _ = torch.linalg.solve_ex(system, e - j @ (b / d))
-    return (b / d + scaled @ multiplier).squeeze(-1).to(jacobian.dtype)
-
 
 logger = logging.getLogger(__name__)
 FrameType = Literal["body", "site", "geom"]
@@ -157,7 +127,11 @@ class DifferentialIKAction(ActionTerm):
         dofs = env.sim.mj_model.jnt_dofadr[joints].tolist()
         self._dofs = as_columns(dofs, self.device)
         self._find_frame()
-        self._posture = self._find_posture()
+        self._posture = self._entity.data.default_joint_pos[:, self._columns].clone()
+        given = resolve_expr(cfg.posture_target or {}, tuple(self._joint_names), None)
+        for column, value in enumerate(given):
+            if value is not None:
+                self._posture[:, column] = float(value)
         self._raw_actions = torch.zeros(
             self.num_envs, self.action_dim, dtype=torch.float32, device=self.device
         )
@@ -302,25 +276,41 @@ class DifferentialIKAction(ActionTerm):
             self._frame_rotation = getattr(sim.data, f"{cfg.frame_type}_xmat")[:, frame]
         self._body_ids = torch.full((self.num_envs,), body, dtype=torch.int32, device=self.device)
 
-    def _find_posture(self) -> torch.Tensor:
-        posture = self._entity.data.default_joint_pos[:, self._columns].clone()
-        given = resolve_expr(self.cfg.posture_target or {}, tuple(self._joint_names), None)
-        for column, value in enumerate(given):
-            if value is not None:
-                posture[:, column] = float(value)
-        return posture
+
+def damped_least_squares(
+    jacobian: torch.Tensor, error: torch.Tensor, stiffness: torch.Tensor, pull: torch.Tensor
+) -> torch.Tensor:
+    """Return x = (J'J + D)^-1 (J'e + b), with D a diagonal of positive numbers.
+
+    It is computed as x = D^-1 (b + J'y) with (J D^-1 J' + I) y = e - J D^-1 b (the matrix inversion
+    lemma). That system has the size of the task, not of the arm, its eigenvalues are at least 1,
+    and for an arm that can move freely its condition does not depend on the damping, while that of
+    J'J + D grows with its inverse square: in single precision that fails from a damping of about
+    1e-3 downward. Singular poses still make it ill-conditioned, so it is solved in double
+    precision, which costs no more time here.
+
+    Args:
+        jacobian: J, (N, m, n). error: e, (N, m). stiffness: D, (N, n). pull: b, (N, n).
+
+    Returns (N, n), in the precision of `jacobian`.
+    """
+    j, e = jacobian.double(), error.double().unsqueeze(-1)
+    d, b = stiffness.double().unsqueeze(-1), pull.double().unsqueeze(-1)
+    scaled = j.mT / d
+    system = j @ scaled
+    system.diagonal(dim1=-2, dim2=-1).add_(1.0)
+    # Without a check of the outcome, which would wait for a GPU: the matrix is positive definite.
+    multiplier, _ = torch.linalg.solve_ex(system, e - j @ (b / d))
+    return (b / d + scaled @ multiplier).squeeze(-1).to(jacobian.dtype)
 
 
 def _check_cfg(cfg: DifferentialIKActionCfg) -> None:
-    allowed = get_args(FrameType)
-    if cfg.frame_type not in allowed:
-        raise ValueError(f"frame_type is {cfg.frame_type!r}; it has to be one of {allowed}.")
+    check_one_of("frame_type", cfg.frame_type, get_args(FrameType))
     for name in (*_WEIGHTS, "damping"):
         value = getattr(cfg, name)
         if not (math.isfinite(value) and value >= 0.0):
-            raise ValueError(f"{name} is {value!r}; it has to be a finite number, at least 0.")
-    if not cfg.max_dq > 0.0:
-        raise ValueError(f"max_dq is {cfg.max_dq!r}; it has to be positive (rad or m).")
+            raise ValueError(f"{name}: expected a finite number >= 0, got {value!r}.")
+    check_positive("max_dq", cfg.max_dq)
     if cfg.position_weight == 0.0 and cfg.orientation_weight == 0.0:
         raise ValueError(
             "position_weight and orientation_weight are both 0, so that the frame is free to be "

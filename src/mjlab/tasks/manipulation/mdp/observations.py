@@ -13,7 +13,7 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.managers.term_checks import checked_when_built, nearest, require_command, require_sensor
+from mjlab.managers.term_checks import checked_when_built, require_command, require_sensor
 from mjlab.sensor import CameraSensor
 from mjlab.tasks.manipulation.mdp.commands import (
     LiftingCommand,
@@ -22,6 +22,7 @@ from mjlab.tasks.manipulation.mdp.commands import (
 )
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import quat_apply_inverse
+from mjlab.utils.string import suggest
 
 if TYPE_CHECKING:
     import torch
@@ -81,7 +82,7 @@ def check_entity(env: ManagerBasedRlEnv, name: str, label: str) -> None:
     """Raise `ValueError` unless the scene has an entity of that name."""
     if name not in env.scene.entities:
         raise ValueError(
-            f"{label} is {name!r}; the scene has no such entity. {nearest(name, env.scene.entities)}"
+            f"{label} is {name!r}; the scene has no such entity. {suggest(name, env.scene.entities)}"
         )
 
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.compat import older_names
+from mjlab.envs.mdp.rewards import self_collision_cost as self_collision_cost
 from mjlab.managers.term_checks import checked_when_built
 from mjlab.tasks.tracking.mdp.commands import body_columns, check_motion_term, motion_command
-from mjlab.tasks.velocity.mdp.rewards import self_collision_cost as self_collision_cost
 from mjlab.utils.lab_api.math import quat_error_magnitude
 
 if TYPE_CHECKING:

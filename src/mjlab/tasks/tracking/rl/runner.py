@@ -148,7 +148,7 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
         if sampler is not None:
             infos = {**(infos or {}), _FAILURES: sampler.failed.cpu().clone()}
         super().save(path, infos)
-        if not self._writes:
+        if not self._is_main_process:
             return
         folder = Path(path).resolve().parent
         try:

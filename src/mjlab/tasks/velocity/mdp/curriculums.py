@@ -9,9 +9,10 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.managers.term_checks import check_range, checked_when_built, nearest, require_command
+from mjlab.managers.term_checks import check_range, checked_when_built, require_command
 from mjlab.tasks.velocity.mdp.rewards import velocity_command
 from mjlab.tasks.velocity.mdp.velocity_command import RANGES, UniformVelocityCommand
+from mjlab.utils.string import suggest
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -133,7 +134,7 @@ def _check_stages(
             if key != "step" and key not in RANGES:
                 raise ValueError(
                     f"velocity_stages: the stage of step {stage['step']} has {key!r}. "
-                    f"{nearest(key, RANGES)}"
+                    f"{suggest(key, RANGES)}"
                 )
             if key != "step" and bounds is not None:
                 check_range(f"velocity_stages: {key} of the stage of step {stage['step']}", bounds)

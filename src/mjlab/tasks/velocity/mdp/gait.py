@@ -15,12 +15,13 @@ import torch
 
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.managers.term_checks import checked_when_built, nearest, require_command, require_sensor
+from mjlab.managers.term_checks import checked_when_built, require_command, require_sensor
 from mjlab.sensor import TerrainHeightSensor
 from mjlab.tasks.velocity.mdp.observations import check_height_sensor
 from mjlab.tasks.velocity.mdp.rewards import command_speed, values_of_joints
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import quat_apply_inverse
+from mjlab.utils.string import suggest
 from mjlab.utils.torch import constant_tensor
 
 if TYPE_CHECKING:
@@ -90,7 +91,7 @@ class GaitClockCommand(CommandTerm):
         name, names = cfg.velocity_command_name, list(env.cfg.commands)
         if name is not None and env.cfg.commands.get(name) is None:
             raise ValueError(
-                f"velocity_command_name: unknown command {name!r}; {nearest(name, names)} Use None "
+                f"velocity_command_name: unknown command {name!r}; {suggest(name, names)} Use None "
                 "for a clock that always runs."
             )
         self.cycles = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)

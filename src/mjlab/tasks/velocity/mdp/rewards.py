@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.compat import accepts_older_params, older_names
+from mjlab.envs.mdp.rewards import self_collision_cost as self_collision_cost
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.term_checks import (
-    check_contact_sensor,
     check_std,
     checked_when_built,
     require_command,
@@ -531,22 +531,6 @@ class upright:
         if self._body is None:
             return data.root_link_quat_w
         return data.body_link_quat_w[:, self._body]
-
-
-@checked_when_built(check_contact_sensor)
-def self_collision_cost(
-    env: ManagerBasedRlEnv, sensor_name: str, force_threshold: float = 10.0
-) -> torch.Tensor:
-    """Count unwanted contacts, of the robot with itself or with the ground.
-
-    With a history of forces it is the number of those last substeps in which any contact had a
-    force above `force_threshold` (N), without one the number of contacts.
-    """
-    data = env.scene[sensor_name].data
-    if data.force_history is None:
-        return data.found.sum(dim=1).float()
-    hits = data.force_history.square().sum(dim=-1) > force_threshold**2
-    return hits.any(dim=1).sum(dim=1).float()
 
 
 def _check_body(

@@ -248,7 +248,15 @@ def test_reset_zeroes_targets_of_these_environments_and_keeps_the_bias(kit, env_
     articulation = EntityArticulationInfoCfg(actuators=(cable, push))
     _, scene = kit.make(NUM_ENVS, arm=kit.cfg(kit.ARM, articulation=articulation))
     data = scene["arm"].data
-    targets = data._targets()
+    targets = (
+        data.joint_pos_target,
+        data.joint_vel_target,
+        data.joint_effort_target,
+        data.tendon_len_target,
+        data.tendon_vel_target,
+        data.tendon_effort_target,
+        data.site_effort_target,
+    )
     assert [t.shape[1] for t in targets] == [2, 2, 2, 1, 1, 1, 1]
     for target in (*targets, data.encoder_bias):
         target.fill_(0.5)

@@ -19,7 +19,7 @@ from mjlab.viewer.viser.camera_viewer import (
 )
 from mjlab.viewer.viser.overlays import ViserCameraOverlays
 
-from ..sensor.camera_scenes import BALL, scene_with, sense  # noqa: TID252
+from ...sensor.camera_scenes import BALL, scene_with, sense  # noqa: TID252
 
 ALL = ("rgb", "depth", "segmentation")
 

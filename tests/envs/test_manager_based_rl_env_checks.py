@@ -46,16 +46,16 @@ def nothing_is_built(monkeypatch):
 @pytest.mark.parametrize(
     ("path", "value", "words"),
     [
-        ("decimation", 2.5, "decimation is 2.5.*whole number"),
-        ("decimation", True, "decimation is True"),
-        ("decimation", "4", "decimation is '4'"),
-        ("scene.num_envs", "4", "scene.num_envs is '4'.*whole number"),
-        ("scene.num_envs", 4.0, "scene.num_envs is 4.0"),
+        ("decimation", 2.5, "decimation.*2.5"),
+        ("decimation", True, "decimation.*True"),
+        ("decimation", "4", "decimation.*'4'"),
+        ("scene.num_envs", "4", "scene.num_envs.*'4'"),
+        ("scene.num_envs", 4.0, "scene.num_envs.*4.0"),
         ("scene.entities", {"x": None}, r"scene.entities\['x'\] is None"),
-        ("sim.mujoco.timestep", "0.01", "timestep is '0.01'"),
-        ("episode_length_s", math.inf, "episode_length_s is inf.*finite"),
-        ("episode_length_s", math.nan, "episode_length_s is nan.*finite"),
-        ("episode_length_s", None, "episode_length_s is None"),
+        ("sim.mujoco.timestep", "0.01", "timestep.*'0.01'"),
+        ("episode_length_s", math.inf, "episode_length_s.*finite.*inf"),
+        ("episode_length_s", math.nan, "episode_length_s.*finite.*nan"),
+        ("episode_length_s", None, "episode_length_s.*None"),
     ],
 )
 @pytest.mark.usefixtures("nothing_is_built")

@@ -1,4 +1,4 @@
-"""Reward, metric and termination terms against their formulas."""
+"""Reward and metric terms against their formulas."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from mjlab.actuator import IdealPdActuatorCfg
-from mjlab.envs.mdp import metrics, rewards, terminations
+from mjlab.envs.mdp import metrics, rewards
 from mjlab.managers.reward_manager import RewardTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 
@@ -108,7 +108,7 @@ def test_posture_wants_every_joint_covered(moving: Any) -> None:
         posture(moving, {".*": 0.5, "elbow": 1.0}, joint_names=(".*",))
 
 
-# Orientation, height, time
+# Orientation
 
 
 def test_tilt_of_the_root(make_world: Any) -> None:
@@ -116,40 +116,32 @@ def test_tilt_of_the_root(make_world: Any) -> None:
     angle = torch.tensor([0.0, 0.5, 1.0, 3.1])
     world.sim.data.qpos[:, 3] = torch.cos(angle / 2)
     world.sim.data.qpos[:, 4] = torch.sin(angle / 2)
-    world.sim.data.qpos[:, 2] = torch.tensor([0.1, 0.2, 0.3, 0.4])
     world.sim.forward()
     torch.testing.assert_close(
         rewards.flat_orientation_l2(world), torch.sin(angle) ** 2, atol=1e-5, rtol=1e-4
     )
-    fallen = terminations.bad_orientation(world, limit_angle=0.7)
-    assert fallen.tolist() == [False, False, True, True]
-    low = terminations.root_height_below_minimum(world, minimum_height=0.25)
-    assert low.tolist() == [True, True, False, False]
 
 
-def test_a_tilt_beyond_what_acos_takes_is_no_nan() -> None:
-    """Rounding makes the cosine of an upright or overturned root slightly more than one."""
-    down = torch.tensor([[0.0, 0.0, -1.0000002], [0.0, 0.0, 1.0000002], [0.0, 0.6, -0.8]])
-    assert torch.acos(-down[:2, 2]).isnan().all()
-    data = SimpleNamespace(projected_gravity_b=down.clone())
-    env: Any = SimpleNamespace(scene={"robot": SimpleNamespace(data=data)})
-    overturned = terminations.bad_orientation(env, limit_angle=3.0)
-    assert overturned.tolist() == [False, True, False]
-    assert terminations.bad_orientation(env, limit_angle=0.5).tolist() == [False, True, True]
-    # The observation is not clamped on the way.
-    assert torch.equal(data.projected_gravity_b, down)
+# Collisions
 
 
-def test_time_out_is_reached_at_the_maximum_length(make_world: Any) -> None:
-    world = make_world()
-    world.episode_length_buf[:] = torch.tensor([0, 9, 10, 11])
-    assert terminations.time_out(world).tolist() == [False, False, True, True]
+def touched(**data: Any) -> Any:
+    sensor = SimpleNamespace(data=SimpleNamespace(**{"force_history": None, **data}))
+    return SimpleNamespace(scene={"touch": sensor})
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_nan_detection_sees_positions_and_velocities(make_world: Any, bad: float) -> None:
-    world = make_world()
-    assert not terminations.nan_detection(world).any()
-    world.sim.data.qpos[1, 8] = bad
-    world.sim.data.qvel[2, 0] = bad
-    assert terminations.nan_detection(world).tolist() == [False, True, True, False]
+def test_collisions_count_substeps_with_a_strong_contact() -> None:
+    force = torch.zeros(2, 2, 4, 3)
+    force[0, 0, 1] = torch.tensor([6.0, 0.0, 8.1])
+    # The same substep in another slot counts once, and 10 N is not above 10 N.
+    force[0, 1, 1] = torch.tensor([0.0, 30.0, 0.0])
+    force[0, 1, 3] = torch.tensor([-20.0, 0.0, 0.0])
+    force[1, 0, 0] = torch.tensor([10.0, 0.0, 0.0])
+    env = touched(force_history=force)
+    assert rewards.self_collision_cost(env, "touch").tolist() == [2.0, 0.0]
+    assert rewards.self_collision_cost(env, "touch", force_threshold=25.0).tolist() == [1.0, 0.0]
+
+
+def test_without_a_history_collisions_count_contacts() -> None:
+    env = touched(found=torch.tensor([[2.0, 1.0], [0.0, 0.0]]))
+    assert rewards.self_collision_cost(env, "touch").tolist() == [3.0, 0.0]

@@ -1,82 +1,20 @@
-"""Panels and overlays of the browser viewer, driven as another viewer would."""
+"""Overlays of the browser viewer, driven as another viewer would."""
 
 from __future__ import annotations
 
-import logging
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from viewer_fakes import FakeEnv
 
-from mjlab.viewer.viser import MjlabViserScene, RewardBarPanel, ViserTermPlotter
+from mjlab.viewer.viser import MjlabViserScene
 from mjlab.viewer.viser.overlays import (
     ViserCameraOverlays,
     ViserContactOverlays,
     ViserDebugOverlays,
     ViserTermOverlays,
 )
-
-
-def term(name: str, value: float) -> tuple[str, np.ndarray]:
-    return name, np.array([value])
-
-
-class TestRewardBars:
-    """Means over the last second."""
-
-    def test_bars_are_cut_with_a_warning_and_compare_with_the_largest(
-        self, viser_server, caplog
-    ) -> None:
-        with caplog.at_level(logging.WARNING):
-            panel = RewardBarPanel(viser_server, ["a", "b<", "c"], 0.02, max_terms=2)
-        assert "3 terms" in caplog.text
-        panel.update([term("a", 2.0), term("b<", -1.0), term("c", 100.0)])
-        assert "width:100.0%" in panel._html.content
-        assert "width:50.0%" in panel._html.content
-        assert "b&lt;" in panel._html.content
-
-    @pytest.mark.parametrize(("update_dt", "mean"), [(0.1, 94.5), (0.25, 97.5), (3.0, 99.0)])
-    def test_the_window_is_a_second(self, viser_server, update_dt, mean) -> None:
-        panel = RewardBarPanel(viser_server, ["a"], update_dt)
-        for value in range(100):
-            panel.update([term("a", value)])
-        assert f"{mean:+.4f}" in panel._html.content
-        panel.clear_histories()
-        panel.refresh()
-        assert f"{0.0:+.4f}" in panel._html.content
-
-    def test_it_leaves_nothing_behind(self, viser_server) -> None:
-        panel = RewardBarPanel(viser_server, ["a"], 0.1)
-        panel.cleanup()
-        assert not viser_server.gui._container_handle_from_uuid["root"]._children
-
-
-class TestTermPlotter:
-    """Curves of terms."""
-
-    def test_points_are_recorded_and_shown_up_to_the_length_asked_for(self, viser_server) -> None:
-        plotter = ViserTermPlotter(viser_server, ["a", "b"], "Metrics", 3, env_idx=4)
-        for value in range(5):
-            plotter.update([term("a", value), term("b", -value)])
-        for name, sign in (("a", 1), ("b", -1)):
-            steps, values = plotter._plots[name].data
-            assert steps.tolist() == [-2, -1, 0]
-            assert values.tolist() == [sign * 2, sign * 3, sign * 4]
-        assert "Metrics terms of environment 4" in plotter._label.content
-
-    def test_another_environment_starts_over(self, viser_server) -> None:
-        plotter = ViserTermPlotter(viser_server, ["a"])
-        plotter.update([term("a", 1.0)])
-        plotter.update_env_idx(2)
-        plotter.update([term("a", 5.0)])
-        assert plotter._plots["a"].data[1].tolist() == [5.0]
-        assert "environment 2" in plotter._label.content
-
-    def test_it_leaves_nothing_behind(self, viser_server) -> None:
-        plotter = ViserTermPlotter(viser_server, ["a", "b"])
-        plotter.cleanup()
-        assert not viser_server.gui._container_handle_from_uuid["root"]._children
 
 
 @pytest.fixture

@@ -336,12 +336,12 @@ def test_an_environment_alone_moves_as_among_others(make):
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
-        (lambda cfg: setattr(cfg.scene, "num_envs", 0), "scene.num_envs is 0"),
-        (lambda cfg: setattr(cfg.scene, "num_envs", -4), "scene.num_envs is -4"),
-        (lambda cfg: setattr(cfg, "decimation", 0), "decimation is 0"),
-        (lambda cfg: setattr(cfg.sim.mujoco, "timestep", 0.0), "timestep is 0.0"),
-        (lambda cfg: setattr(cfg.sim.mujoco, "timestep", math.nan), "timestep is nan"),
-        (lambda cfg: setattr(cfg, "episode_length_s", -1.0), "episode_length_s is -1.0"),
+        (lambda cfg: setattr(cfg.scene, "num_envs", 0), "scene.num_envs.*0"),
+        (lambda cfg: setattr(cfg.scene, "num_envs", -4), "scene.num_envs.*-4"),
+        (lambda cfg: setattr(cfg, "decimation", 0), "decimation.*0"),
+        (lambda cfg: setattr(cfg.sim.mujoco, "timestep", 0.0), "timestep.*0.0"),
+        (lambda cfg: setattr(cfg.sim.mujoco, "timestep", math.nan), "timestep.*nan"),
+        (lambda cfg: setattr(cfg, "episode_length_s", -1.0), "episode_length_s.*-1.0"),
         (lambda cfg: setattr(cfg, "episode_length_s", 0.0), "'time_out' would fire at every step"),
         (lambda cfg: setattr(cfg.sim, "engine", "magic"), "Unknown engine 'magic'"),
         (lambda cfg: setattr(cfg.sim, "num_threads", -1), "num_threads"),

@@ -267,7 +267,7 @@ class TestCheckpoints:
         panel = viewer._checkpoint_panel
         assert panel._choice.value == "model_50.pt (2h ago)"
         assert "[a run](https://example.com/run) (finished)" in panel._about.content
-        panel._use_latest()
+        panel.load_latest()
         viewer._process_actions()
         assert loaded == ["model_100.pt"]
         assert manager.current_name == "model_100.pt"
@@ -277,7 +277,7 @@ class TestCheckpoints:
         source = local_checkpoints(folder, lambda path: loaded.append(path.name) or push())
         viewer = make(viser_server, manager=source)
         (folder / "model_2000.pt").touch()
-        viewer._checkpoint_panel._use_latest()
+        viewer._checkpoint_panel.load_latest()
         viewer._process_actions()
         assert loaded == ["model_2000.pt"]
 
