@@ -1,4 +1,4 @@
-"""Draw the pictures of the documentation: `python docs/make_pictures.py`.
+"""Draw the pictures of the documentation: `python tools/make_pictures.py`.
 
 It renders offscreen and needs no display. Run it again when a terrain preset or the example of
 `variants.md` changes.
@@ -25,7 +25,8 @@ from mjlab.viewer.offscreen_renderer import OffscreenRenderer, open_renderer
 from mjlab.viewer.viewer_config import ViewerConfig
 from mjlab.viewer.viser.camera_viewer import depth_colors, segmentation_colors
 
-_IMAGES = Path(__file__).parent / "images"
+_DOCS = Path(__file__).parents[1] / "docs"
+_IMAGES = _DOCS / "images"
 
 # Extent of one terrain, in metres, and how difficult those of a strip are.
 _SIZE = 8.0
@@ -104,7 +105,7 @@ def camera_pictures(engine: Literal["native", "warp"]) -> dict[str, np.ndarray]:
 
 def draw_variants(path: Path) -> None:
     """Draw the example of `variants.md` as it stands there, a while after it was dropped."""
-    page = (Path(__file__).parent / "variants.md").read_text(encoding="utf-8")
+    page = (_DOCS / "how-to" / "variants.md").read_text(encoding="utf-8")
     example: dict[str, Any] = {}
     exec(page.split("```python\n")[1].split("```")[0], example)
     plane = TerrainEntityCfg(terrain_type="plane")
