@@ -30,8 +30,8 @@ OF_SEVERAL_LAYERS = {"mjlab", "mjlab.viewer", "mjlab.viewer.native"}
 UPWARD = {"Entity", "EntityData", "ManagerBasedRlEnv"}
 
 FAMILIES = {f"mjlab.tasks.{name}" for name in ("cartpole", "manipulation", "tracking", "velocity")}
-# Modules outside a task family that import it: commands of motion tracking, and older names.
-USERS_OF_FAMILIES = ("mjlab.scripts.csv_to_npz", "mjlab.scripts.motion_page", *ABOVE_ALL)
+# Modules outside a task family that import it: a command of motion tracking, and older names.
+USERS_OF_FAMILIES = ("mjlab.scripts.csv_to_npz", *ABOVE_ALL)
 BETWEEN_FAMILIES = {("mjlab.tasks.tracking.mdp.rewards", "mjlab.tasks.velocity.mdp.rewards")}
 
 

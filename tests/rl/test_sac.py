@@ -12,12 +12,12 @@ import onnxruntime
 import pytest
 import torch
 from rl_fake_env import FakeEnv, FakeEnvCfg, FakeSceneCfg
+from tensordict import TensorDict
 from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
 from mjlab.rl.config import RslRlOffPolicyRunnerCfg, RslRlSacAlgorithmCfg
-from mjlab.rl.rsl import TensorDict
 from mjlab.rl.sac_models import SquashedGaussian, TwinCriticModel
 
 

@@ -59,5 +59,5 @@ def test_switching_a_sensor_off_hides_what_it_draws_and_nothing_else(env) -> Non
 
 
 def test_a_sensor_that_does_not_draw_is_named_among_those_that_do(env) -> None:
-    with pytest.raises(ValueError, match="'imu'.*foot_height_scan"):
+    with pytest.raises(ValueError, match=r"'imu'.*foot_height_scan"):
         env.sensor_visualizers.set_debug_vis("imu", False)

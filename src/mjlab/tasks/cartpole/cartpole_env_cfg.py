@@ -89,7 +89,7 @@ cpu = cpu_profile(
     gamma=0.98,
     max_iterations=500,
 )
-"""The `cpu` profile of the swing-up. `docs/learning.md` has the experiments."""
+"""The `cpu` profile of the swing-up. `docs/guides/learning.md` has the experiments."""
 
 
 # The environments.
