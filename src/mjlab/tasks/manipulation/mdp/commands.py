@@ -28,6 +28,13 @@ if TYPE_CHECKING:
     from mjlab.sim import Simulation
     from mjlab.viewer.debug_visualizer import Color, DebugVisualizer
 
+__all__ = [
+    "LiftingCommand",
+    "LiftingCommandCfg",
+    "MultiCubeLiftingCommand",
+    "MultiCubeLiftingCommandCfg",
+]
+
 FIXED_GOAL = (0.4, 0.0, 0.3)
 """The goal of difficulty `fixed`, in metres from the environment's origin."""
 _GOAL_RADIUS = 0.03

@@ -31,6 +31,17 @@ if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
 
+__all__ = [
+    "camera_depth",
+    "camera_rgb",
+    "camera_segmentation",
+    "camera_target_cube_mask",
+    "ee_to_object_distance",
+    "ee_velocity",
+    "object_to_goal_distance",
+    "target_position",
+]
+
 DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 """The entity whose site terms take for the hand unless they are told."""
 _GEOM = int(mujoco.mjtObj.mjOBJ_GEOM)

@@ -31,6 +31,14 @@ if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
 
+__all__ = [
+    "bring_object_reward",
+    "joint_velocity_hinge_penalty",
+    "multi_cube_bring_object_reward",
+    "multi_cube_staged_position_reward",
+    "staged_position_reward",
+]
+
 
 @checked_when_built(check_single_with_hand)
 def staged_position_reward(

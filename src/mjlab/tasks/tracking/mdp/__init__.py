@@ -10,37 +10,12 @@ from mjlab.envs.mdp import *  # noqa: F403
 from mjlab.envs.mdp import __all__ as _library
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.sensor import ContactSensor
-from mjlab.tasks.tracking.mdp.commands import MotionCommand, MotionCommandCfg, MotionLoader
-from mjlab.tasks.tracking.mdp.metrics import (
-    compute_ee_orientation_error,
-    compute_ee_position_error,
-    compute_joint_velocity_error,
-    compute_mpkpe,
-    compute_root_relative_mpkpe,
-)
-from mjlab.tasks.tracking.mdp.observations import (
-    motion_anchor_ori_b,
-    motion_anchor_pos_b,
-    robot_body_ori_b,
-    robot_body_pos_b,
-)
-from mjlab.tasks.tracking.mdp.rewards import (
-    motion_global_anchor_orientation_error_exp,
-    motion_global_anchor_position_error_exp,
-    motion_global_body_angular_velocity_error_exp,
-    motion_global_body_linear_velocity_error_exp,
-    motion_relative_body_orientation_error_exp,
-    motion_relative_body_position_error_exp,
-    self_collision_cost,
-)
-from mjlab.tasks.tracking.mdp.terminations import (
-    bad_anchor_ori,
-    bad_anchor_pos,
-    bad_anchor_pos_z_only,
-    bad_motion_body_pos,
-    bad_motion_body_pos_z_only,
-    motion_ended,
-)
+from mjlab.tasks.tracking.mdp import commands, metrics, observations, rewards, terminations
+from mjlab.tasks.tracking.mdp.commands import *  # noqa: F403
+from mjlab.tasks.tracking.mdp.metrics import *  # noqa: F403
+from mjlab.tasks.tracking.mdp.observations import *  # noqa: F403
+from mjlab.tasks.tracking.mdp.rewards import *  # noqa: F403
+from mjlab.tasks.tracking.mdp.terminations import *  # noqa: F403
 from mjlab.utils.lab_api.math import subtract_frame_transforms
 
 if TYPE_CHECKING:
@@ -51,32 +26,12 @@ __all__ = [
     "CommandTermCfg",
     "ContactSensor",
     "DebugVisualizer",
-    "MotionCommand",
-    "MotionCommandCfg",
-    "MotionLoader",
-    "bad_anchor_ori",
-    "bad_anchor_pos",
-    "bad_anchor_pos_z_only",
-    "bad_motion_body_pos",
-    "bad_motion_body_pos_z_only",
-    "compute_ee_orientation_error",
-    "compute_ee_position_error",
-    "compute_joint_velocity_error",
-    "compute_mpkpe",
-    "compute_root_relative_mpkpe",
-    "motion_anchor_ori_b",
-    "motion_anchor_pos_b",
-    "motion_ended",
-    "motion_global_anchor_orientation_error_exp",
-    "motion_global_anchor_position_error_exp",
-    "motion_global_body_angular_velocity_error_exp",
-    "motion_global_body_linear_velocity_error_exp",
-    "motion_relative_body_orientation_error_exp",
-    "motion_relative_body_position_error_exp",
-    "robot_body_ori_b",
-    "robot_body_pos_b",
-    "self_collision_cost",
     "subtract_frame_transforms",
+    *commands.__all__,
+    *metrics.__all__,
+    *observations.__all__,
+    *rewards.__all__,
+    *terminations.__all__,
     *(name for name in _library if name != "DebugVisualizer"),
     *older_exports(__name__),
 ]

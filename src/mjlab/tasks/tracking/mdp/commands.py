@@ -47,6 +47,12 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.viewer.debug_visualizer import DebugVisualizer
 
+__all__ = [
+    "MotionCommand",
+    "MotionCommandCfg",
+    "MotionLoader",
+]
+
 _MODES = ("adaptive", "uniform", "start")
 _DRAWINGS = ("ghost", "frames")
 # Lengths of the axes, in metres: of bodies and of the anchor.

@@ -23,6 +23,14 @@ from mjlab.utils.lab_api.math import quat_error_magnitude
 if TYPE_CHECKING:
     from mjlab.tasks.tracking.mdp.motion_library import MotionFrame, MotionReader
 
+__all__ = [
+    "compute_ee_orientation_error",
+    "compute_ee_position_error",
+    "compute_joint_velocity_error",
+    "compute_mpkpe",
+    "compute_root_relative_mpkpe",
+]
+
 _COMMAND = "motion"
 _END_EFFECTORS = "ee_body_pos"
 _END = "motion_ended"

@@ -14,6 +14,13 @@ from mjlab.utils.lab_api.math import quat_apply_inverse, quat_conjugate, quat_mu
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
+__all__ = [
+    "motion_anchor_ori_b",
+    "motion_anchor_pos_b",
+    "robot_body_ori_b",
+    "robot_body_pos_b",
+]
+
 
 @checked_when_built(check_motion_term)
 def motion_anchor_pos_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:

@@ -18,6 +18,15 @@ from mjlab.utils.lab_api.math import quat_error_magnitude
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
+__all__ = [
+    "motion_global_anchor_orientation_error_exp",
+    "motion_global_anchor_position_error_exp",
+    "motion_global_body_angular_velocity_error_exp",
+    "motion_global_body_linear_velocity_error_exp",
+    "motion_relative_body_orientation_error_exp",
+    "motion_relative_body_position_error_exp",
+]
+
 BodyNames = tuple[str, ...] | None
 
 

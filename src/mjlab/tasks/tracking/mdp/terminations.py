@@ -15,6 +15,15 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.managers.scene_entity_config import SceneEntityCfg
 
+__all__ = [
+    "bad_anchor_ori",
+    "bad_anchor_pos",
+    "bad_anchor_pos_z_only",
+    "bad_motion_body_pos",
+    "bad_motion_body_pos_z_only",
+    "motion_ended",
+]
+
 BodyNames = tuple[str, ...] | None
 
 

@@ -18,6 +18,12 @@ if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
 
+__all__ = [
+    "VelocityStage",
+    "commands_vel",
+    "terrain_levels_vel",
+]
+
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 
 __getattr__ = older_names(__name__)

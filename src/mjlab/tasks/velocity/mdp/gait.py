@@ -29,6 +29,18 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.managers.reward_manager import RewardTermCfg
 
+__all__ = [
+    "GaitClockCommand",
+    "GaitClockCommandCfg",
+    "feet_apart_l2",
+    "feet_height_by_phase",
+    "feet_tilt",
+    "height_over_feet",
+    "root_height_l2",
+    "root_near_feet",
+    "weighted_joint_deviation",
+]
+
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 # Longer than any episode: the phase goes on until the next reset.
 _ONLY_AT_RESETS = (1e9, 1e9)

@@ -16,6 +16,13 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.managers.scene_entity_config import SceneEntityCfg
 
+__all__ = [
+    "foot_air_time",
+    "foot_contact",
+    "foot_contact_forces",
+    "foot_height",
+]
+
 
 def check_found_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
     """Check a term that asks whether there is contact."""

@@ -48,6 +48,20 @@ if TYPE_CHECKING:
     from mjlab.managers.reward_manager import RewardTermCfg
     from mjlab.viewer.debug_visualizer import DebugVisualizer
 
+__all__ = [
+    "angular_momentum_penalty",
+    "body_angular_velocity_penalty",
+    "feet_air_time",
+    "feet_clearance",
+    "feet_slip",
+    "feet_swing_height",
+    "soft_landing",
+    "track_angular_velocity",
+    "track_linear_velocity",
+    "upright",
+    "variable_posture",
+]
+
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 
 

@@ -24,6 +24,11 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.managers import ObservationTermCfg
 
+__all__ = [
+    "SteppingGains",
+    "stepping_action",
+]
+
 _SIDES = ("left", "right")
 # Each turns about its axis when the leg hangs straight, as on Unitree's humanoids.
 _AXES = {

@@ -14,6 +14,11 @@ if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
 
+__all__ = [
+    "out_of_terrain_bounds",
+    "terrain_edge_reached",
+]
+
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 # Positions are those of before the reset until the second step of an episode.
 _MIN_STEPS = 2

@@ -14,6 +14,10 @@ from mjlab.utils.errors import WrongTypeError
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
+__all__ = [
+    "terrain_normal_from_sensors",
+]
+
 _EPS = float(torch.finfo(torch.float32).eps)
 # Points lie in a plane if their spread across it is below this share of the spread along it.
 _MAX_THICKNESS = 0.1

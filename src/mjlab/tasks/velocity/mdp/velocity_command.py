@@ -24,6 +24,11 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.viewer.debug_visualizer import Color, DebugVisualizer
 
+__all__ = [
+    "UniformVelocityCommand",
+    "UniformVelocityCommandCfg",
+]
+
 RANGES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 """The ranges that every velocity command has."""
 _PROBABILITIES = (
