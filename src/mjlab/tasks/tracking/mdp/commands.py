@@ -187,7 +187,15 @@ class MotionCommand(MotionReader, CommandTerm):
             name: torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
             for name in (*tracking_metrics(self), *_SAMPLING_METRICS)
         }
-        sampler = self._make_sampler()
+        sampler = HardSegmentSampler(
+            self.motion.lengths.tolist(),
+            env.step_dt,
+            cfg.adaptive_kernel_size,
+            cfg.adaptive_lambda,
+            cfg.adaptive_uniform_ratio,
+            cfg.adaptive_alpha,
+            self.device,
+        )
         self._num_bins = sampler.num_bins
         self.sampler = sampler if cfg.sampling_mode == "adaptive" else None
         self.start_perturbation = 1.0
@@ -206,18 +214,6 @@ class MotionCommand(MotionReader, CommandTerm):
         ]
         self.drawing = MotionDrawing(self)
         self._panel: MotionPanel | None = None
-
-    def _make_sampler(self) -> HardSegmentSampler:
-        cfg = self.cfg
-        return HardSegmentSampler(
-            self.motion.lengths.tolist(),
-            self._env.step_dt,
-            cfg.adaptive_kernel_size,
-            cfg.adaptive_lambda,
-            cfg.adaptive_uniform_ratio,
-            cfg.adaptive_alpha,
-            self.device,
-        )
 
     @property
     def command(self) -> torch.Tensor:

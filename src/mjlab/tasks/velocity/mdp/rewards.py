@@ -17,14 +17,8 @@ import torch
 
 from mjlab.compat import accepts_older_params, older_names
 from mjlab.envs.mdp.rewards import self_collision_cost as self_collision_cost
-from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.managers.term_checks import (
-    check_std,
-    checked_when_built,
-    require_command,
-    require_sensor,
-)
-from mjlab.sensor import RayCastSensor
+from mjlab.managers import RewardTermCfg, SceneEntityCfg
+from mjlab.managers.term_checks import check_std, checked_when_built, require_command
 from mjlab.tasks.velocity.mdp.observations import (
     Source,
     check_air_time_sensor,
@@ -36,7 +30,10 @@ from mjlab.tasks.velocity.mdp.observations import (
     height_columns,
     site_columns,
 )
-from mjlab.tasks.velocity.mdp.terrain_utils import terrain_normal_from_sensors
+from mjlab.tasks.velocity.mdp.terrain_utils import (
+    check_terrain_sensors,
+    terrain_normal_from_sensors,
+)
 from mjlab.utils.errors import check_positive
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
@@ -45,7 +42,6 @@ from mjlab.utils.lab_api.string import resolve_matching_names_values
 if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
-    from mjlab.managers.reward_manager import RewardTermCfg
     from mjlab.viewer.debug_visualizer import DebugVisualizer
 
 __all__ = [
@@ -135,8 +131,7 @@ class upright:
         self._env = env
         self._asset_cfg: SceneEntityCfg = cfg.params.get("asset_cfg", _DEFAULT_ASSET_CFG)
         self._body = single_body(env, self._asset_cfg)
-        for name in cfg.params.get("terrain_sensor_names") or ():
-            require_sensor(env, name, RayCastSensor)
+        check_terrain_sensors(env, cfg.params.get("terrain_sensor_names") or ())
         self._up = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float32, device=env.device)
         # What the last reward was compared with, for drawing.
         self._normal = self._up.repeat(env.num_envs, 1)

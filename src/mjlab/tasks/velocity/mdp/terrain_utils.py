@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from mjlab.managers.term_checks import require_sensor
 from mjlab.sensor import RayCastSensor
 from mjlab.utils.errors import WrongTypeError
 
@@ -52,6 +53,12 @@ def terrain_normal_from_sensors(
     if len(points) == 1:
         return fit_terrain_normal(points[0], valid[0])
     return fit_terrain_normal(torch.cat(points, dim=1), torch.cat(valid, dim=1))
+
+
+def check_terrain_sensors(env: ManagerBasedRlEnv, sensor_names: tuple[str, ...]) -> None:
+    """Raise `ValueError` or `TypeError` unless these are ray sensors of the scene."""
+    for name in sensor_names:
+        require_sensor(env, name, RayCastSensor)
 
 
 @functools.lru_cache(maxsize=64)

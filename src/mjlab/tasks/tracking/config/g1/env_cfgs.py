@@ -65,11 +65,20 @@ def unitree_g1_flat_tracking_env_cfg(
     joint_pos = cfg.actions["joint_pos"]
     assert isinstance(joint_pos, mdp.JointPositionActionCfg)
     joint_pos.scale = dict(G1_ACTION_SCALE)
-    motion = _motion(cfg)
+    motion = cfg.commands["motion"]
+    assert isinstance(motion, mdp.MotionCommandCfg)
     motion.motion_file = MOTIONS
     motion.anchor_body_name = _TORSO
     motion.body_names = _BODIES
-    _set_names(cfg)
+    friction, base_com = cfg.events["foot_friction"], cfg.events["base_com"]
+    end_effectors = cfg.terminations["ee_body_pos"]
+    assert friction is not None
+    assert base_com is not None
+    assert end_effectors is not None
+    friction.params["asset_cfg"].geom_names = _FOOT_GEOMS
+    base_com.params["asset_cfg"].body_names = (_TORSO,)
+    end_effectors.params["body_names"] = _END_EFFECTORS
+    cfg.viewer.body_name = _TORSO
     if not has_state_estimation:
         actor = cfg.observations["actor"]
         assert actor is not None
@@ -87,31 +96,14 @@ def unitree_g1_flat_tracking_no_state_estimation_env_cfg(
     return unitree_g1_flat_tracking_env_cfg(has_state_estimation=False, play=play)
 
 
-def _motion(cfg: ManagerBasedRlEnvCfg) -> mdp.MotionCommandCfg:
-    motion = cfg.commands["motion"]
-    assert isinstance(motion, mdp.MotionCommandCfg)
-    return motion
-
-
-def _set_names(cfg: ManagerBasedRlEnvCfg) -> None:
-    friction, base_com = cfg.events["foot_friction"], cfg.events["base_com"]
-    end_effectors = cfg.terminations["ee_body_pos"]
-    assert friction is not None
-    assert base_com is not None
-    assert end_effectors is not None
-    friction.params["asset_cfg"].geom_names = _FOOT_GEOMS
-    base_com.params["asset_cfg"].body_names = (_TORSO,)
-    end_effectors.params["body_names"] = _END_EFFECTORS
-    cfg.viewer.body_name = _TORSO
-
-
 def _make_playable(cfg: ManagerBasedRlEnvCfg) -> None:
     cfg.episode_length_s = int(1e9)
     actor = cfg.observations["actor"]
     assert actor is not None
     actor.enable_corruption = False
     cfg.events.pop("push_robot")
-    motion = _motion(cfg)
+    motion = cfg.commands["motion"]
+    assert isinstance(motion, mdp.MotionCommandCfg)
     motion.pose_range = {}
     motion.velocity_range = {}
     motion.joint_position_range = (0.0, 0.0)
