@@ -5,10 +5,11 @@ from mjlab.envs.mdp import *  # noqa: F403
 from mjlab.envs.mdp import __all__ as _library
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.sensor import CameraSensor, ContactSensor
-from mjlab.tasks.manipulation.mdp import commands, observations, rewards
+from mjlab.tasks.manipulation.mdp import commands, observations, rewards, terminations
 from mjlab.tasks.manipulation.mdp.commands import *  # noqa: F403
 from mjlab.tasks.manipulation.mdp.observations import *  # noqa: F403
 from mjlab.tasks.manipulation.mdp.rewards import *  # noqa: F403
+from mjlab.tasks.manipulation.mdp.terminations import *  # noqa: F403
 
 __all__ = [
     "CameraSensor",
@@ -18,6 +19,7 @@ __all__ = [
     *commands.__all__,
     *observations.__all__,
     *rewards.__all__,
+    *terminations.__all__,
     *_library,
     *older_exports(__name__),
 ]

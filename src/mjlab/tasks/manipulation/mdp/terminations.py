@@ -1,6 +1,8 @@
 """Termination terms of the manipulation tasks. Each returns bool (N,)."""
 
 from mjlab.compat import older_names
-from mjlab.envs.mdp.terminations import illegal_contact as illegal_contact
+from mjlab.envs.mdp.terminations import illegal_contact
+
+__all__ = ["illegal_contact"]
 
 __getattr__ = older_names(__name__)

@@ -120,13 +120,12 @@ class MotionPanel:
             self._was_moved = False
         motion, frame = self._get_frame(index)
         last = int(self._library.lengths[motion]) - 1
-        for shown, attribute, value in (
-            (self._frame, "max", last),
-            (self._frame, "value", frame),
-            (self._motion, "value", self._library.names[motion]),
-        ):
-            if getattr(shown, attribute) != value:
-                setattr(shown, attribute, value)
+        if self._frame.max != last:
+            self._frame.max = last
+        if self._frame.value != frame:
+            self._frame.value = frame
+        if self._motion.value != self._library.names[motion]:
+            self._motion.value = self._library.names[motion]
         now = time.perf_counter()
         if now >= self._next_table or wanted is not None:
             self._next_table = now + _TABLE_PERIOD_S

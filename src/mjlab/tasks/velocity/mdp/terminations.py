@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.compat import older_names
-from mjlab.envs.mdp.terminations import illegal_contact as illegal_contact
+from mjlab.envs.mdp.terminations import illegal_contact
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 
 if TYPE_CHECKING:
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
 __all__ = [
+    "illegal_contact",
     "out_of_terrain_bounds",
     "terrain_edge_reached",
 ]
