@@ -250,7 +250,7 @@ def test_a_sphere_marks_the_goal_of_the_environment_in_view():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"entity_name": "cub"}, r"entity_name is 'cub', .* \['cube'\]"),
+        ({"entity_name": "cub"}, "entity_name 'cub'.*'cube'"),
         ({"difficulty": "hard"}, "difficulty.*'fixed', 'dynamic'.*'hard'"),
         ({"success_threshold": 0.0}, "success_threshold.* 0.0"),
         ({"success_threshold": math.nan}, "success_threshold.* nan"),
@@ -269,7 +269,7 @@ def test_a_mistake_in_the_config_is_one_clear_message(fields, message):
 
 def test_an_object_that_cannot_move_is_refused_unless_it_stays():
     env = StandInEnv(cube=Object(4, [0], is_fixed_base=True))
-    with pytest.raises(ValueError, match="'cube', which has a fixed base.*free joint"):
+    with pytest.raises(ValueError, match="'cube' has a fixed base.*free joint"):
         lifting_command(env)
     lifting_command(env, object_pose_range=None)
 

@@ -440,7 +440,7 @@ def test_the_state_of_a_run_on_motions_of_other_lengths_is_refused(make_env, tmp
         ({"motion_file": ""}, "No motion is named"),
         ({"motion_file": "nothing.npz"}, "motion 'nothing.npz'"),
         ({"anchor_body_name": "head"}, "anchor_body_name is 'head'; it has to be one of body_names"),
-        ({"entity_name": "dog"}, r"entity_name is 'dog', but the scene's entities are .*'robot'"),
+        ({"entity_name": "dog"}, "entity_name 'dog'.*'robot'"),
         ({"body_names": ("pelvis", "torso_link", "tail")}, r"names \['tail'\], which entity"),
         ({"body_names": ("torso_link", "pelvis")}, "first of body_names is 'torso_link'"),
         ({"body_names": ("pelvis", "torso_link", "pelvis")}, "names a body twice"),

@@ -17,7 +17,7 @@ from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.term_checks import check_range
 from mjlab.tasks.manipulation.mdp.goal_panel import GoalPanel
-from mjlab.utils.errors import check_one_of, check_positive
+from mjlab.utils.errors import check_exists, check_one_of, check_positive
 from mjlab.utils.lab_api.math import sample_ranges
 
 if TYPE_CHECKING:
@@ -355,8 +355,7 @@ class MultiCubeLiftingCommand(GoalCommand):
         if not cfg.entity_names:
             raise ValueError("entity_names is empty; name the objects, of which one is wanted.")
         self.objects: list[Entity] = [
-            require_object(env, name, "A name in entity_names", is_moved=True)
-            for name in cfg.entity_names
+            require_object(env, name, "entity_names", is_moved=True) for name in cfg.entity_names
         ]
         self.target_selection = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         ids = [torch.as_tensor(one.indexing.geom_ids).long().cpu() for one in self.objects]
@@ -415,14 +414,12 @@ def check_pose_range(within: Any) -> None:
 
 def require_object(env: ManagerBasedRlEnv, name: str, label: str, is_moved: bool) -> Entity:
     """Return an entity of the scene; raises `ValueError` if there is none, or it cannot move."""
-    entities = env.scene.entities
-    if name not in entities:
-        raise ValueError(f"{label} is {name!r}, but the scene's entities are {list(entities)}.")
-    entity: Entity = entities[name]
+    check_exists(f"entity in {label}", name, env.scene.entities)
+    entity: Entity = env.scene.entities[name]
     if is_moved and entity.is_fixed_base:
         raise ValueError(
-            f"{label} is {name!r}, which has a fixed base, so that it cannot be lifted. Give its "
-            "root body a free joint."
+            f"{label}: {name!r} has a fixed base, so that it cannot be lifted. Give its root body a "
+            "free joint."
         )
     return entity
 

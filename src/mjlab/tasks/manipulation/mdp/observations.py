@@ -22,10 +22,9 @@ from mjlab.tasks.manipulation.mdp.commands import (
     MultiCubeLiftingCommand,
     check_reach,
 )
-from mjlab.utils.errors import WrongTypeError, check_positive
+from mjlab.utils.errors import WrongTypeError, check_exists, check_positive
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import quat_apply_inverse
-from mjlab.utils.string import suggest
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -300,8 +299,7 @@ def check_multi_with_hand(
 
 def check_entity(env: ManagerBasedRlEnv, name: str, label: str) -> None:
     """Raise `ValueError` unless the scene has an entity of that name."""
-    if name not in env.scene.entities:
-        raise ValueError(f"{label}: unknown entity {name!r}; {suggest(name, env.scene.entities)}")
+    check_exists(f"entity in {label}", name, env.scene.entities)
 
 
 def check_site(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> str:

@@ -31,7 +31,13 @@ from mjlab.tasks.tracking.mdp.motion_sampling import (
     draw_uniform,
     perturbed_start,
 )
-from mjlab.utils.errors import WrongTypeError, check_count, check_one_of, check_positive
+from mjlab.utils.errors import (
+    WrongTypeError,
+    check_count,
+    check_exists,
+    check_one_of,
+    check_positive,
+)
 from mjlab.utils.indexing import as_ids, is_empty
 from mjlab.utils.lab_api.math import (
     matrix_from_quat,
@@ -566,11 +572,7 @@ def find_robot(cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> Entity:
         ValueError: there is no such entity, it has a fixed base, it lacks a tracked body, or the
             first tracked body is not its floating base.
     """
-    if cfg.entity_name not in env.scene.entities:
-        raise ValueError(
-            f"entity_name is {cfg.entity_name!r}, but the scene's entities are "
-            f"{list(env.scene.entities)}."
-        )
+    check_exists("entity in entity_name", cfg.entity_name, env.scene.entities)
     robot: Entity = env.scene[cfg.entity_name]
     if robot.is_fixed_base:
         raise ValueError(

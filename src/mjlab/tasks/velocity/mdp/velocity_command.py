@@ -13,7 +13,7 @@ from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.term_checks import check_range
 from mjlab.tasks.velocity.mdp.velocity_joystick import VelocityJoystick
-from mjlab.utils.errors import check_in_range
+from mjlab.utils.errors import check_exists, check_in_range
 from mjlab.utils.indexing import as_ids, is_empty
 from mjlab.utils.lab_api.math import matrix_from_quat, quat_apply, wrap_to_pi
 
@@ -156,11 +156,7 @@ class UniformVelocityCommand(CommandTerm):
         # The ranges change at run time, so that they are the term's own.
         super().__init__(dataclasses.replace(cfg, ranges=dataclasses.replace(cfg.ranges)), env)
         check_command_cfg(cfg)
-        if cfg.entity_name not in env.scene.entities:
-            raise ValueError(
-                f"entity_name is {cfg.entity_name!r}, but the scene's entities are "
-                f"{list(env.scene.entities)}."
-            )
+        check_exists("entity in entity_name", cfg.entity_name, env.scene.entities)
         self.robot: Entity = env.scene[cfg.entity_name]
         if cfg.init_velocity_prob > 0.0 and self.robot.is_fixed_base:
             raise ValueError(
