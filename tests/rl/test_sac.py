@@ -12,10 +12,10 @@ import onnxruntime
 import pytest
 import torch
 from rl_fake_env import FakeEnv, FakeEnvCfg, FakeSceneCfg
+from tensordict import TensorDict
 
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
 from mjlab.rl.config import RslRlOffPolicyRunnerCfg, RslRlSacAlgorithmCfg
-from mjlab.rl.rsl import TensorDict
 
 
 def mirror(env: Any, obs: Any = None, actions: Any = None) -> tuple[Any, Any]:

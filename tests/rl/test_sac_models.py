@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 
 from mjlab.rl.config import gaussian_distribution
-from mjlab.rl.rsl import TensorDict
 from mjlab.rl.sac_models import SacActorModel, SquashedGaussian, TwinCriticModel
 
 

@@ -27,15 +27,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 
 from mjlab.rl.learners import Learner
-from mjlab.rl.rsl import TensorDict
 from mjlab.utils.errors import MjlabError
 from mjlab.utils.os import replacing
 from mjlab.utils.random import rng_state, set_rng_state
 
 if TYPE_CHECKING:
-    from mjlab.rl.rsl import VecEnv
+    from rsl_rl.env import VecEnv
 
 logger = logging.getLogger(__name__)
 

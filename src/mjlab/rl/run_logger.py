@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from rsl_rl.utils.logger import Logger
 
 from mjlab.rl.checkpoint import ensure_writable_folder
-from mjlab.rl.rsl import Logger, enable_wandb
 from mjlab.utils.os import replacing
 
 if TYPE_CHECKING:
@@ -464,11 +464,10 @@ def _writer_config(wanted: str | dict[str, Any], cfg: dict[str, Any]) -> str | d
     """Return what rsl_rl makes the writer from."""
     if wanted == "wandb":
         wanted = {"class_name": "WandbLogWriter", "project_name": cfg.get("wandb_project")}
-    if isinstance(wanted, dict) and wanted.get("class_name") == "WandbLogWriter":
-        enable_wandb()
-        if not cfg.get("upload_git_diff", False):
-            # wandb makes a difference of its own, of the repository around the working folder.
-            os.environ.setdefault("WANDB_DISABLE_CODE", "true")
+    is_wandb = isinstance(wanted, dict) and wanted.get("class_name") == "WandbLogWriter"
+    if is_wandb and not cfg.get("upload_git_diff", False):
+        # wandb makes a difference of its own, of the repository around the working folder.
+        os.environ.setdefault("WANDB_DISABLE_CODE", "true")
     return wanted
 
 

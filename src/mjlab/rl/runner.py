@@ -18,6 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.env import VecEnv
+from rsl_rl.runners import OnPolicyRunner
+from rsl_rl.utils import check_nan
+from tensordict import TensorDict
 
 from mjlab.rl.checkpoint import (
     RunRescue,
@@ -40,15 +45,6 @@ from mjlab.rl.networks import (
     shared_parameters_allowed,
 )
 from mjlab.rl.replay import ReplayFiles, ReplayStorage
-from mjlab.rl.rsl import (
-    PPO,
-    OnPolicyRunner,
-    TensorDict,
-    VecEnv,
-    check_nan,
-    enable_torch_compile,
-    keep_compiler_out_of_step,
-)
 from mjlab.rl.run_logger import RunLogger, TrainingObserver
 from mjlab.utils.processes import process_rank
 from mjlab.utils.random import seed_rng, session_seed
@@ -95,15 +91,11 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 `symmetry_cfg` has no function that makes mirror images.
         """
         prepare_train_cfg(env, train_cfg)
-        if train_cfg.get("torch_compile_mode"):
-            enable_torch_compile()
         # rsl_rl prints networks and observation sets.
         with contextlib.redirect_stdout(io.StringIO()) as printed, shared_parameters_allowed():
             super().__init__(env, train_cfg, log_dir, device)
         logger.debug("%s", printed.getvalue().rstrip())
         deduplicate_parameters(self.alg.optimizer)
-        if not train_cfg.get("torch_compile_mode"):
-            keep_compiler_out_of_step(self.alg.optimizer)
         self.logger: RunLogger = RunLogger(
             log_dir=log_dir,
             cfg=self.cfg,

@@ -20,18 +20,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
-
-from mjlab.rl.config import RslRlSacAlgorithmCfg
-from mjlab.rl.replay import ReplayStorage
-from mjlab.rl.rsl import (
-    TensorDict,
-    VecEnv,
+from rsl_rl.env import VecEnv
+from rsl_rl.utils import (
     reduce_gradients_in_buckets,
     resolve_callable,
     resolve_class,
     resolve_obs_groups,
 )
+from tensordict import TensorDict
+from torch import nn
+
+from mjlab.rl.config import RslRlSacAlgorithmCfg
+from mjlab.rl.replay import ReplayStorage
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
 
 # Of returns whose scale is estimated, where no range of values is given.

@@ -13,9 +13,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.modules.distribution import Distribution
+from rsl_rl.utils import resolve_nn_activation
+from tensordict import TensorDict
 from torch import nn
-
-from mjlab.rl.rsl import Distribution, MLPModel, TensorDict, resolve_nn_activation
 
 _LOG_2PI = math.log(2.0 * math.pi)
 
