@@ -439,7 +439,7 @@ def test_evaluations_may_be_harder_than_training(make_runner):
 
 @pytest.mark.parametrize("name", ["speed", "success_rate"])
 def test_conditions_on_what_is_not_measured_are_refused_at_once(make_runner, name):
-    with pytest.raises(ValueError, match=f"names '{name}', which is not measured"):
+    with pytest.raises(ValueError, match=f"'{name}' is not measured.*'mean_return'"):
         make_runner(evaluation=asdict(EvaluationCfg(solved_below={name: 1.0})))
 
 

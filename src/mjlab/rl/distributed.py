@@ -30,6 +30,7 @@ import torch
 
 from mjlab.utils.errors import MjlabError, UserError
 from mjlab.utils.processes import PARENT_VARIABLE, ProcessRank, cores_per_process, process_rank
+from mjlab.utils.signals import handled_signals
 
 T = TypeVar("T")
 
@@ -89,8 +90,15 @@ def launch_workers(
     shared |= {"WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count)}
     shared.setdefault("OMP_NUM_THREADS", str(max(1, cores_per_process() // count)))
     workers: list[subprocess.Popen[bytes]] = []
+    received: list[signal.Signals] = []
     killed = set()
-    with _forwarding_signals(workers) as received:
+
+    def forward(number: int, frame: FrameType | None) -> None:
+        received.append(_FORWARDED[number])
+        for worker in workers:
+            worker.send_signal(_FORWARDED[number])
+
+    with handled_signals(forward, _FORWARDED):
         for rank in range(count):
             own = {**shared, "RANK": str(rank), "LOCAL_RANK": str(rank)}
             # A session of its own: a terminal sends Ctrl-C to all processes of its session, and a
@@ -301,32 +309,6 @@ class ProcessOutput(io.TextIOBase):
 
 
 # Helpers of launching and joining.
-
-
-@contextlib.contextmanager
-def _forwarding_signals(
-    workers: list[subprocess.Popen[bytes]],
-) -> Generator[list[signal.Signals]]:
-    """Send `workers` the signals that would end this process; yield those that have arrived."""
-    received: list[signal.Signals] = []
-
-    def forward(number: int, frame: FrameType | None) -> None:
-        received.append(_FORWARDED[number])
-        for worker in workers:
-            worker.send_signal(_FORWARDED[number])
-
-    # What is ignored, as SIGHUP under nohup, stays ignored.
-    previous = {
-        number: signal.signal(number, forward)
-        for number in _FORWARDED
-        if signal.getsignal(number) != signal.SIG_IGN
-    }
-    try:
-        yield received
-    finally:
-        for number, handler in previous.items():
-            # A handler that was not set from Python reads as None and cannot be set again.
-            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
 
 def _running(workers: list[subprocess.Popen[bytes]]) -> list[int]:

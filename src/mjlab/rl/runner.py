@@ -308,26 +308,21 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         final = extras["final_observations"].to(self.device)
         ids = extras["final_ids"].to(self.device)
         time_outs = extras["time_outs"].to(self.device)
+        # Not the compiled critic, which would be compiled for each number of time-outs.
+        critic = self.alg._raw_critic
+        if critic.is_recurrent:
+            # The hidden state is of all environments, and has seen the observations before the step.
+            hidden_state = critic.get_hidden_state()
+            everywhere = observations.clone()
+            everywhere[ids] = final
+            values = critic(everywhere)[ids]
+            critic.reset(hidden_state=hidden_state)
+        else:
+            values = critic(final)
         # A wrapper may have found that an episode terminated after all.
-        values = self._final_values(observations, final, ids) * time_outs[ids]
+        values = values.detach().squeeze(-1) * time_outs[ids]
         rewards = rewards.index_add(0, ids, (self.alg.gamma * values).to(rewards.dtype))
         return rewards, {**extras, "time_outs": time_outs.index_fill(0, ids, False)}
-
-    def _final_values(
-        self, observations: TensorDict, final: TensorDict, ids: torch.Tensor
-    ) -> torch.Tensor:
-        """Return the critic's values (k,) of `final`, observations of the environments `ids`."""
-        # Compiled models would be compiled for each k.
-        critic = self.alg._raw_critic
-        if not critic.is_recurrent:
-            return critic(final).detach().squeeze(-1)
-        # The hidden state is of all environments, and has seen the observations before the step.
-        hidden_state = critic.get_hidden_state()
-        everywhere = observations.clone()
-        everywhere[ids] = final
-        values = critic(everywhere).detach().squeeze(-1)[ids]
-        critic.reset(hidden_state=hidden_state)
-        return values
 
     def _update(self) -> dict[str, float]:
         """Learn from what was collected; return the losses.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import signal
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from types import FrameType
 from typing import Any
 
@@ -56,6 +56,27 @@ class StopRequest:
     def _restore_handlers(self, without: int | None = None) -> None:
         for number in [number for number in self._previous if number != without]:
             handler = self._previous.pop(number)
+            # A handler that was not set from Python reads as None and cannot be set again.
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+
+
+@contextlib.contextmanager
+def handled_signals(
+    handle: Callable[[int, FrameType | None], None], numbers: Iterable[int]
+) -> Generator[None]:
+    """Call `handle` for the signals `numbers` within the block, then restore the handlers.
+
+    Ignored signals, such as SIGHUP under `nohup`, stay ignored.
+    """
+    previous = {
+        number: signal.signal(number, handle)
+        for number in numbers
+        if signal.getsignal(number) != signal.SIG_IGN
+    }
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
             # A handler that was not set from Python reads as None and cannot be set again.
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 

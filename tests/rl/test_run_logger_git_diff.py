@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mjlab.rl.git_diff import write_git_diff
+from mjlab.rl.run_logger import write_git_diff
 
 
 def git(folder: Path, *arguments: str) -> None:
