@@ -16,14 +16,8 @@ from mjlab.scripts.flags import is_given
 from mjlab.scripts.run_folder import read_run_info, run_folders
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.processes import PARENT_VARIABLE
+from mjlab.utils.signals import FORWARDED, not_ignored, replace_handlers, restore_handlers
 
-# Signals that end this process, and what the training process gets for each: it handles the first
-# two by saving.
-_FORWARDED: dict[int, signal.Signals] = {
-    signal.SIGINT: signal.SIGINT,
-    signal.SIGTERM: signal.SIGTERM,
-    signal.SIGHUP: signal.SIGTERM,
-}
 _SEEDS_HELP = "--seeds N    Train with the seeds 1, 2, ..., N, one after the other (default: 5)."
 
 
@@ -107,13 +101,9 @@ def run_forwarding_signals(command: list[str], seconds: float | None = None) -> 
         if child is None:
             early.append(number)
         else:
-            child.send_signal(_FORWARDED[number])
+            child.send_signal(FORWARDED[number])
 
-    # What is ignored, as SIGHUP under nohup, stays ignored.
-    handlers = {number: signal.getsignal(number) for number in _FORWARDED}
-    handlers = {number: old for number, old in handlers.items() if old != signal.SIG_IGN}
-    for number in handlers:
-        signal.signal(number, forward)
+    previous = replace_handlers(forward, not_ignored(FORWARDED))
     try:
         # A session of its own, because a terminal sends Ctrl-C to all processes of its session,
         # and a second signal tells training to stop at once.
@@ -132,9 +122,7 @@ def run_forwarding_signals(command: list[str], seconds: float | None = None) -> 
                 child.send_signal(signal.SIGINT)
             return child.wait(), stopped
     finally:
-        for number, old in handlers.items():
-            # A handler that was not set from Python reads as None and cannot be set again.
-            signal.signal(number, old if old is not None else signal.SIG_DFL)
+        restore_handlers(previous)
 
 
 def plot_command(argv: list[str], prog: str) -> None:
