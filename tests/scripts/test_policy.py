@@ -97,13 +97,13 @@ def test_settings_that_no_network_has_are_said_to_be_the_runs(run, trained, tmp_
     shutil.copytree(trained, folder)
     params = folder / "params" / "agent.yaml"
     saved = yaml.safe_load(params.read_text())
-    saved["actor"]["hidden_dims"] = [64, -1]
+    saved["actor"]["activation"] = "nonsense"
     params.write_text(yaml.safe_dump(saved))
     checkpoint = str(next(folder.glob("model_*.pt")))
     outcome = run("evaluate", TASK, "--device", "cpu", "--checkpoint-file", checkpoint)
     assert outcome.status == 1
     assert "agent.yaml" in outcome.message
-    assert "-1" in outcome.message
+    assert "nonsense" in outcome.message
 
 
 @pytest.mark.parametrize(

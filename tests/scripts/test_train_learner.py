@@ -82,7 +82,7 @@ def test_a_learner_that_does_not_exist_is_told_with_those_that_do(run, script):
 def test_counts_of_sac_are_checked(run):
     outcome = run("train", TASK, "--learner", "sac", "--agent.algorithm.num-updates", "0")
     assert outcome.status == 1
-    assert "--agent.algorithm.num-updates is 0" in outcome.message
+    assert "--agent.algorithm.num-updates: expected an integer >= 1, got 0" in outcome.message
 
 
 # The run.

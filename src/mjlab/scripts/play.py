@@ -132,14 +132,18 @@ def _make_viewer(
         )
     viewer = ViserPlayViewer(env, policy, checkpoint_manager=manager, host=cfg.host, port=cfg.port)
     print(f"Open {viewer.url} in a browser. Ctrl-C ends.", flush=True)
-    # Without a display, Linux would open a browser for the terminal, in this terminal.
-    if cfg.open_browser and (sys.platform in ("darwin", "win32") or _has_display()):
+    if cfg.open_browser and _can_open_browser():
         webbrowser.open(viewer.url)
     return viewer
 
 
 def _has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _can_open_browser() -> bool:
+    # Without a display, Linux would open a browser for the terminal, in this terminal.
+    return sys.platform in ("darwin", "win32") or _has_display()
 
 
 def _video_cfg(cfg: PlayConfig) -> VideoCfg:

@@ -13,14 +13,13 @@ from mjlab.rl.config import RslRlBaseRunnerCfg
 from mjlab.rl.learners import Learner, learner_of
 from mjlab.scripts.flags import is_given
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
-from mjlab.utils.errors import BadCallError, UserError
+from mjlab.utils.errors import BadCallError, UserError, check_count
 from mjlab.utils.gpu import select_gpus
 from mjlab.utils.processes import ProcessRank, process_rank
 from mjlab.utils.random import process_seed
 from mjlab.viewer.page_server import check_address
 
 _AGENT_COUNTS = ("num_steps_per_env", "max_iterations", "save_interval")
-
 _ALGORITHM_COUNTS = (
     "num_learning_epochs",
     "num_mini_batches",
@@ -32,7 +31,6 @@ _ALGORITHM_COUNTS = (
     "noise_hold",
     "gradient_length",
 )
-
 _SEPARATORS = ("/", "\\")
 
 
@@ -120,9 +118,22 @@ class TrainConfig:
 
 
 def check_flags(cfg: TrainConfig) -> None:
-    """Raise UserError for what is wrong in the flags and can be told without building anything."""
+    """Raise UserError or ValueError for wrong flags that can be told without building anything."""
     _check_numbers(cfg)
-    _check_names(cfg)
+    # Names that would put the run's folder elsewhere than below that of all runs.
+    run_name, experiment = cfg.agent.run_name, cfg.agent.experiment_name
+    if any(separator in run_name for separator in _SEPARATORS):
+        raise UserError(
+            f"--agent.run-name is {run_name!r}; it is part of one folder's name and may not hold "
+            "a path separator. Runs are grouped by --agent.experiment-name."
+        )
+    if Path(experiment).is_absolute() or ".." in experiment.replace("\\", "/").split("/"):
+        raise UserError(
+            f"--agent.experiment-name is {experiment!r}; it names a folder within --log-root, so "
+            "it may be neither absolute nor contain '..'. Choose another place with --log-root."
+        )
+    if cfg.live:
+        check_address(cfg.live_host, cfg.live_port, "--live-")
 
 
 def check_typed_flags(cfg: TrainConfig, flags: list[str]) -> None:
@@ -183,8 +194,7 @@ def _check_numbers(cfg: TrainConfig) -> None:
         )
     counts |= {"--video-length": cfg.video_length, "--video-interval": cfg.video_interval}
     for flag, value in counts.items():
-        if value < 1:
-            raise UserError(f"{flag.replace('_', '-')} is {value}; it has to be at least 1.")
+        check_count(flag.replace("_", "-"), value)
     # An infinite bound, as of gradients, is one that is not there.
     for name, value in vars(agent.algorithm).items():
         if isinstance(value, float) and (
@@ -192,20 +202,3 @@ def _check_numbers(cfg: TrainConfig) -> None:
         ):
             flag = f"--agent.algorithm.{name.replace('_', '-')}"
             raise UserError(f"{flag}: expected a finite number, got {value}.")
-    if cfg.live:
-        check_address(cfg.live_host, cfg.live_port, "--live-")
-
-
-def _check_names(cfg: TrainConfig) -> None:
-    """Refuse names that would put the run's folder elsewhere than below that of all runs."""
-    run_name, experiment = cfg.agent.run_name, cfg.agent.experiment_name
-    if any(separator in run_name for separator in _SEPARATORS):
-        raise UserError(
-            f"--agent.run-name is {run_name!r}; it is part of one folder's name and may not hold "
-            "a path separator. Runs are grouped by --agent.experiment-name."
-        )
-    if Path(experiment).is_absolute() or ".." in experiment.replace("\\", "/").split("/"):
-        raise UserError(
-            f"--agent.experiment-name is {experiment!r}; it names a folder within --log-root, so "
-            "it may be neither absolute nor contain '..'. Choose another place with --log-root."
-        )

@@ -55,9 +55,7 @@ def _take_count(flags: list[str]) -> tuple[int, list[str]]:
                 value = flags[end] if end < len(flags) else ""
                 end += 1
             if not value.isdigit() or int(value) < 1:
-                raise UserError(
-                    f"--seeds is {value!r}; give the number of seeds, such as --seeds 5."
-                )
+                raise UserError(f"--seeds: expected an integer >= 1, got {value!r}.")
             return int(value), flags[:position] + flags[end:]
     return 5, flags
 
