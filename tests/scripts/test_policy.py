@@ -159,4 +159,5 @@ def test_fields_of_the_environment_are_flags_of_evaluate_and_play(run):
 def test_numbers_of_play_that_cannot_be_are_refused(run, flag, value):
     outcome = run("play", TASK, "--agent", "zero", flag, value)
     assert outcome.status == 1
-    assert f"{flag} is {value}" in outcome.message
+    assert flag in outcome.message
+    assert value in outcome.message

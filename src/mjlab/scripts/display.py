@@ -92,7 +92,16 @@ class TrainingDisplay(TrainingObserver):
         last = stats.iteration == stats.total_iterations
         if last or now - self._last_line >= _SECONDS_BETWEEN_LINES:
             self._last_line = now
-            self._console.print(_line(stats), highlight=False, soft_wrap=True)
+            line = (
+                f"[{stats.iteration}/{stats.total_iterations}] "
+                f"{stats.steps_per_second:,.0f} steps/s "
+                f"(collection {stats.collection_time:.2f} s, learning {stats.learning_time:.2f} s), "
+                f"mean reward {_figure(stats.mean_reward)}, "
+                f"episode length {_figure(stats.mean_episode_length)}, "
+                f"step reward {stats.mean_step_reward:.3f}, {left} left"
+            )
+            # A bracket begins markup.
+            self._console.print(line.replace("[", r"\[", 1), highlight=False, soft_wrap=True)
 
     def on_evaluation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
         """Tell how an evaluation went."""
@@ -166,18 +175,6 @@ def _let_go_of(is_gone: Callable[[os.stat_result], bool]) -> None:
     with open(os.devnull, "wb") as nowhere, contextlib.suppress(OSError):
         for number in [number for number in (1, 2) if is_gone(os.fstat(number))]:
             os.dup2(nowhere.fileno(), number)
-
-
-def _line(stats: IterationStats) -> str:
-    return (
-        f"[{stats.iteration}/{stats.total_iterations}] "
-        f"{stats.steps_per_second:,.0f} steps/s "
-        f"(collection {stats.collection_time:.2f} s, learning {stats.learning_time:.2f} s), "
-        f"mean reward {_figure(stats.mean_reward)}, "
-        f"episode length {_figure(stats.mean_episode_length)}, "
-        f"step reward {stats.mean_step_reward:.3f}, "
-        f"{duration(stats.time_left)} left"
-    ).replace("[", r"\[", 1)
 
 
 def _figure(value: float | None) -> str:

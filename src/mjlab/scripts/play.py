@@ -92,7 +92,18 @@ def run_play(task: str, cfg: PlayConfig) -> None:
         folder = Path("videos")
         if checkpoint is not None and is_run_folder(checkpoint.parent):
             folder = checkpoint.parent / "videos" / "play"
-        record_policy(task, env_cfg, checkpoint, folder, device, _video_cfg(cfg))
+        video = VideoCfg(
+            length=cfg.num_steps or cfg.video_length,
+            suffix=cfg.video_format,
+            height=cfg.video_height,
+            width=cfg.video_width,
+            camera=cfg.camera,
+            num_envs=cfg.num_envs,
+            engine=cfg.engine,
+            agent=cfg.agent,
+            profile=cfg.profile,
+        )
+        record_policy(task, env_cfg, checkpoint, folder, device, video)
         return
     env = make_env(task, env_cfg, device, cfg.num_envs, cfg.engine, profile=cfg.profile)
     print(f"Physics:    {env.unwrapped.sim.capabilities.description}")
@@ -144,20 +155,6 @@ def _has_display() -> bool:
 def _can_open_browser() -> bool:
     # Without a display, Linux would open a browser for the terminal, in this terminal.
     return sys.platform in ("darwin", "win32") or _has_display()
-
-
-def _video_cfg(cfg: PlayConfig) -> VideoCfg:
-    return VideoCfg(
-        length=cfg.num_steps or cfg.video_length,
-        suffix=cfg.video_format,
-        height=cfg.video_height,
-        width=cfg.video_width,
-        camera=cfg.camera,
-        num_envs=cfg.num_envs,
-        engine=cfg.engine,
-        agent=cfg.agent,
-        profile=cfg.profile,
-    )
 
 
 def main() -> None:

@@ -149,7 +149,18 @@ def check_typed_flags(cfg: TrainConfig, flags: list[str]) -> None:
             "--wandb-run-path with it."
         )
     if is_given("--gpu-ids", flags) and cfg.gpu_ids is not None:
-        _check_gpus_are_used(cfg)
+        if cfg.device is not None and (
+            process_rank().is_alone or not cfg.device.startswith("cuda")
+        ):
+            raise BadCallError(
+                f"--gpu-ids: expected no --device beside it, got {cfg.device!r}; leave out one of "
+                "them."
+            )
+        if select_gpus(cfg.gpu_ids) == (None, 0):
+            raise BadCallError(
+                f"--gpu-ids: expected a GPU, got {cfg.gpu_ids} where none is visible; leave it out "
+                "to train on the CPU."
+            )
     # Networks and algorithms are chosen by their class names, and the runner by the task.
     kinds = {field.name: field.default for field in dataclasses.fields(cfg.agent)}
     name = getattr(cfg.agent, "class_name", None)
@@ -157,18 +168,6 @@ def check_typed_flags(cfg: TrainConfig, flags: list[str]) -> None:
         raise BadCallError(
             f"--agent.class-name: expected {kinds['class_name']!r}, got {name!r}, which nothing reads; "
             "use runner_cls of register_mjlab_task for a runner, or --learner."
-        )
-
-
-def _check_gpus_are_used(cfg: TrainConfig) -> None:
-    if cfg.device is not None and (process_rank().is_alone or not cfg.device.startswith("cuda")):
-        raise BadCallError(
-            f"--gpu-ids: expected no --device beside it, got {cfg.device!r}; leave out one of them."
-        )
-    if select_gpus(cfg.gpu_ids) == (None, 0):
-        raise BadCallError(
-            f"--gpu-ids: expected a GPU, got {cfg.gpu_ids} where none is visible; leave it out to "
-            "train on the CPU."
         )
 
 
