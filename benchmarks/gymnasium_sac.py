@@ -19,10 +19,11 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
 
 from mjlab.rl import MjlabOnPolicyRunner
 from mjlab.rl.config import RslRlOffPolicyRunnerCfg, squashed_gaussian
-from mjlab.rl.rsl import TensorDict, VecEnv
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
 
 

@@ -5,7 +5,7 @@ seed after the other under the task's `cpu` profile, until the task is solved or
 scores the last policy by `evaluate` on a seed that was not trained with. After each seed it writes
 
 - `src/mjlab/reference/TASK.cpu.json` (or `gpu`), which ships with the package and is read by `verify`,
-- `docs/reference/index.md`, and the picture of the task beside it.
+- `docs/reference/runs/index.md`, and the picture of the task beside it.
 
 Seeds that a file has already are kept. Interrupted ones are resumed, unless the code was changed in
 between, because a seed is of one commit: they are then trained from the start. `--again` replaces seeds of
@@ -58,7 +58,7 @@ from mjlab.tasks.registry import UnknownTaskError, list_profiles, list_tasks, re
 from mjlab.utils.errors import UserError  # noqa: E402
 from mjlab.utils.processes import available_cores  # noqa: E402
 
-PAGES = ROOT / "docs" / "reference"
+PAGES = ROOT / "docs" / "reference" / "runs"
 PROFILE = "cpu"
 KINDS: tuple[Kind, ...] = ("cpu", "gpu")
 MINUTES = 60.0

@@ -44,7 +44,7 @@ def test_there_is_a_package_for_each_minor_release():
 
 
 def test_the_page_names_every_package():
-    page = (Path(__file__).parents[1] / "docs" / "packages.md").read_text()
+    page = (Path(__file__).parents[1] / "docs" / "how-to" / "packages.md").read_text()
     assert [path for path in OWN_PACKAGES if path.parent.name not in page] == []
 
 

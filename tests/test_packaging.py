@@ -163,7 +163,7 @@ def test_a_package_pinned_below_is_refused_unless_the_pin_is_overridden(uv, whee
 
 
 def test_a_project_takes_this_mjlab_for_all_its_packages(uv, wheels, tmp_path):
-    """As docs/other_packages.md says: a source, and an override for pins below 1.6."""
+    """As docs/how-to/other_packages.md says: a source, and an override for pins below 1.6."""
     folder = shutil.copytree(wheels, tmp_path / "wheels")
     build_package(tmp_path / "package", folder, "mjlab==1.2.0")
     (wheel,) = folder.glob("mjlab-*.whl")

@@ -1,4 +1,4 @@
-"""The code of `docs/other_learners.md` is taken from the page and run."""
+"""The code of `docs/guides/other_learners.md` is taken from the page and run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("gymnasium")
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "other_learners.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "guides" / "other_learners.md"
 
 
 def blocks() -> dict[str, str]:

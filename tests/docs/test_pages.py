@@ -14,11 +14,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [
-    page
-    for folder in (".", "api", "reference")
-    for page in sorted((ROOT / "docs" / folder).glob("*.md"))
-]
+PAGES = [page for page in sorted((ROOT / "docs").rglob("*.md")) if "_build" not in page.parts]
 
 _COMMAND = re.compile(r"\buv run (?:--extra \S+ |--\S+ )*([\w-]+)")
 _FLAG = re.compile(r"(?<![\w-])--([a-z][\w.-]*[a-z])")
@@ -133,13 +129,13 @@ def test_flags_are_fields_of_the_commands() -> None:
 
 
 def test_flags_on_a_command_line_are_of_that_command() -> None:
-    """Command lines, and the tables of flags in the sections of `docs/command_line.md`."""
+    """Command lines, and the tables of flags in the sections of `docs/reference/command_line.md`."""
     wrong = set()
     for page in [*PAGES, ROOT / "README.md", ROOT / "src/mjlab/demo/README.md"]:
         code = _code(page.read_text(encoding="utf-8")).replace("\\\n", " ")
         for command, rest in _COMMAND_LINE.findall(code):
             wrong |= {f"{page.name}: {command} --{flag}" for flag in _unknown(command, rest)}
-    text = (ROOT / "docs" / "command_line.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reference" / "command_line.md").read_text(encoding="utf-8")
     for command, section in re.findall(r"^## ([\w-]+)\n(.*?)(?=^## |\Z)", text, re.M | re.S):
         if command not in _flags_of():
             continue
@@ -172,7 +168,7 @@ def _resolve(name: str) -> object:
 def test_the_randomization_table_is_that_of_the_code() -> None:
     from mjlab.envs.mdp import dr
 
-    text = (ROOT / "docs" / "randomization.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "how-to" / "randomization.md").read_text(encoding="utf-8")
     rows = re.findall(
         r"^\| `(\w+)` \| `(\w+)`[^|]*\| [^|]+ \| ([^|]+) \| (\w*) ?\|$", text, re.MULTILINE
     )

@@ -1,4 +1,4 @@
-"""What `docs/terrains.md` says and shows."""
+"""What `docs/how-to/terrains.md` says and shows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mjlab.terrains import TerrainGenerator
 from mjlab.terrains.config import ALL_TERRAIN_PRESETS
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-TEXT = (DOCS / "terrains.md").read_text(encoding="utf-8")
+TEXT = (DOCS / "how-to" / "terrains.md").read_text(encoding="utf-8")
 
 
 def test_the_code_of_the_page_builds_its_terrain():
@@ -37,7 +37,7 @@ def test_the_table_has_every_preset():
 
 def test_the_picture_is_there_and_small():
     picture = DOCS / "images" / "terrains.png"
-    assert f"images/{picture.name}" in TEXT
+    assert f"../images/{picture.name}" in TEXT
     data = picture.read_bytes()
     assert len(data) < 400_000
-    assert struct.unpack(">II", data[16:24])[0] == 1280, "see docs/make_pictures.py"
+    assert struct.unpack(">II", data[16:24])[0] == 1280, "see tools/make_pictures.py"

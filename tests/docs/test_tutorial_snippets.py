@@ -1,4 +1,4 @@
-"""The code of `docs/tutorial.md` is taken from the page, put into a package, and run."""
+"""The code of `docs/tutorial/cartpole.md` is taken from the page, put into a package, and run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ import torch
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.tasks import registry
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "tutorial.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "tutorial" / "cartpole.md"
 NUM_ENVS = 4
 
 _BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

@@ -289,7 +289,9 @@ def test_editors_are_applied_to_each_variant_by_the_names_in_its_own_spec() -> N
 
 
 def test_the_example_of_the_documentation_does_what_the_page_says() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "variants.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "variants.md").read_text(
+        encoding="utf-8"
+    )
     example: dict = {}
     exec(page.split("```python\n")[1].split("```")[0], example)
     entity = example["object_cfg"].build()

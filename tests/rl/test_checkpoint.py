@@ -72,11 +72,11 @@ def test_the_file_is_on_the_disk_before_it_takes_its_name(tmp_path: Path, monkey
 
 def test_a_missing_checkpoint_names_those_there_are(tmp_path: Path):
     save_checkpoint({}, tmp_path / "model_7.pt")
-    with pytest.raises(CheckpointError, match=r"model_8.pt'. .*\['model_7.pt'\]"):
+    with pytest.raises(CheckpointError, match=r"model_8.pt': .*\['model_7.pt'\]"):
         load_checkpoint(tmp_path / "model_8.pt")
-    with pytest.raises(CheckpointError, match="its folder does not exist"):
+    with pytest.raises(CheckpointError, match=r"nowhere.*: \[\]"):
         load_checkpoint(tmp_path / "nowhere" / "model_8.pt")
-    with pytest.raises(CheckpointError, match="is a folder"):
+    with pytest.raises(CheckpointError, match=r"found a folder.*\['model_7.pt'\]"):
         load_checkpoint(tmp_path)
 
 

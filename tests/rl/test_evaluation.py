@@ -236,9 +236,9 @@ def test_a_figure_is_found_by_name_and_an_unknown_one_is_refused():
     result = evaluate_policy(counting(), still, metrics={"one": lambda env: torch.ones(4)})
     assert result.value("one") == 1.0
     assert result.value("mean_return") == 5.0
-    with pytest.raises(ValueError, match="no figure 'two'; it has one, mean_return, mean_length"):
+    with pytest.raises(ValueError, match="'two'.*'one', 'mean_return', 'mean_length'"):
         result.value("two")
-    with pytest.raises(ValueError, match="no figure 'success_rate'"):
+    with pytest.raises(ValueError, match="'success_rate'"):
         result.value("success_rate")
 
 

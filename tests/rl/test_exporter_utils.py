@@ -223,7 +223,7 @@ def test_a_policy_that_cannot_be_exported_does_not_lose_the_run(make_runner, tmp
     assert "no such operator" in caplog.text
 
 
-def test_training_and_export_import_neither_compiler_nor_clients(tmp_path: Path):
+def test_training_and_export_import_no_exporters_plots_and_runtimes(tmp_path: Path):
     # In a process of its own, because other tests may have imported them.
     program = f"""
 import sys
@@ -234,13 +234,10 @@ runner = MjlabOnPolicyRunner(
     RslRlVecEnvWrapper(FakeEnv(FakeEnvCfg())), runner_cfg(), {str(tmp_path / "run")!r}
 )
 runner.learn(1)
-print(sorted({{"torch._dynamo", "wandb", "onnxscript", "matplotlib"}} & set(sys.modules)))
-from mjlab.rl.rsl import enable_torch_compile
-enable_torch_compile()
-print("torch._dynamo" in sys.modules)
+print(sorted({{"onnxruntime", "onnxscript", "matplotlib"}} & set(sys.modules)))
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.stdout.splitlines() == ["[]", "True"], done.stderr
+    assert done.stdout.splitlines() == ["[]"], done.stderr
     assert (tmp_path / "run" / "run.onnx").is_file()
 
 

@@ -11,6 +11,8 @@ import onnxruntime
 import pytest
 import torch
 from onnx import TensorProto, helper
+from rsl_rl.models import RNNModel
+from tensordict import TensorDict
 
 from mjlab.rl.exporter_utils import (
     DIGEST_KEY,
@@ -22,7 +24,6 @@ from mjlab.rl.exporter_utils import (
     initializers_digest,
     load_onnx_policy,
 )
-from mjlab.rl.rsl import RNNModel, TensorDict
 
 ACTIVATIONS = {
     "elu": torch.nn.ELU(),

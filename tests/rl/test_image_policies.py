@@ -14,6 +14,8 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
+from rsl_rl.models import CNNModel
+from tensordict import TensorDict
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import ObservationGroupCfg, ObservationTermCfg
@@ -22,7 +24,6 @@ from mjlab.rl.config import RslRlOnPolicyRunnerCfg, RslRlPpoAlgorithmCfg
 from mjlab.rl.evaluation import evaluate_policy
 from mjlab.rl.exporter_utils import OnnxPolicy, OnnxPolicyError, export_to_onnx, load_onnx_policy
 from mjlab.rl.networks import check_networks
-from mjlab.rl.rsl import CNNModel, TensorDict
 from mjlab.rl.spatial_softmax import SpatialSoftmaxCNNModel
 from mjlab.tasks.registry import load_env_cfg
 

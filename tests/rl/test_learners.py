@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from mjlab.rl.config import (
     EvaluationCfg,
@@ -17,7 +18,6 @@ from mjlab.rl.config import (
 )
 from mjlab.rl.learners import acting_cfg, learner_of, with_learner
 from mjlab.rl.networks import check_networks
-from mjlab.rl.rsl import TensorDict
 
 MIRROR = "mjlab.tasks.velocity.symmetry:mirror_left_right"
 

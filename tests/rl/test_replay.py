@@ -6,10 +6,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tensordict import TensorDict
 
 from mjlab.rl.checkpoint import CheckpointError
 from mjlab.rl.replay import ReplayFiles, ReplayStorage
-from mjlab.rl.rsl import TensorDict
 
 NUM_ENVS = 3
 GOES_ON, TERMINATED, TIMED_OUT, CUT_OFF = range(4)

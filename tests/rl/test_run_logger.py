@@ -11,10 +11,11 @@ from typing import Any
 
 import pytest
 import torch
+from rsl_rl.runners import OnPolicyRunner
+from rsl_rl.utils.logger import Logger
 
 from mjlab.rl import MjlabOnPolicyRunner
 from mjlab.rl.plot import plot_run, read_scalars
-from mjlab.rl.rsl import Logger, OnPolicyRunner
 from mjlab.rl.run_logger import RunLogger
 
 NUM_ENVS, STEPS = 3, 4
@@ -184,6 +185,7 @@ def test_weights_and_biases_is_known_by_its_name_and_the_config_stays(
     client.save = lambda path, **kwargs: saved.append(Path(path).name)
     client.config = types.SimpleNamespace(update=lambda values: None)
     monkeypatch.setitem(sys.modules, "wandb", client)
+    monkeypatch.setattr("rsl_rl.utils.wandb_log_writer.wandb", client)
     runner = make_runner(tmp_path / "run", runner_cls=SavesBeside, logger=logger)
     runner.learn(1)
     assert runner.seen["type"] == "wandb"
@@ -234,6 +236,7 @@ def test_only_the_given_repository_is_kept_and_nothing_of_it_uploaded_unless_ask
     client.save = lambda path, **kwargs: saved.append(Path(path).name)
     client.config = types.SimpleNamespace(update=lambda values: None)
     monkeypatch.setitem(sys.modules, "wandb", client)
+    monkeypatch.setattr("rsl_rl.utils.wandb_log_writer.wandb", client)
     monkeypatch.delenv("WANDB_DISABLE_CODE", raising=False)
     runner = make_runner(tmp_path / "run", logger="wandb", **settings)
     runner.add_git_repo_to_log(str(task / "__init__.py"))

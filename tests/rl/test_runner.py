@@ -439,7 +439,7 @@ def test_evaluations_may_be_harder_than_training(make_runner):
 
 @pytest.mark.parametrize("name", ["speed", "success_rate"])
 def test_conditions_on_what_is_not_measured_are_refused_at_once(make_runner, name):
-    with pytest.raises(ValueError, match=f"names '{name}', which is not measured"):
+    with pytest.raises(ValueError, match=f"'{name}' is not measured.*'mean_return'"):
         make_runner(evaluation=asdict(EvaluationCfg(solved_below={name: 1.0})))
 
 
@@ -539,6 +539,7 @@ def test_weights_and_biases_gets_figures_and_files_only_on_request(
         setattr(client, name, lambda *args, _name=name, **kwargs: calls.append((_name, args)))
     client.config = types.SimpleNamespace(update=lambda values: calls.append(("config", values)))
     monkeypatch.setitem(sys.modules, "wandb", client)
+    monkeypatch.setattr("rsl_rl.utils.wandb_log_writer.wandb", client)
 
     make_runner(tmp_path / "plain").learn(1)
     assert calls == []

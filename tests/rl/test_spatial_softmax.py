@@ -6,9 +6,9 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
+from tensordict import TensorDict
 
 from mjlab.rl.exporter_utils import export_to_onnx
-from mjlab.rl.rsl import TensorDict
 from mjlab.rl.spatial_softmax import SpatialSoftmax, SpatialSoftmaxCNN, SpatialSoftmaxCNNModel
 
 CNN_CFG = {

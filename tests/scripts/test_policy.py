@@ -8,9 +8,9 @@ import shutil
 import pytest
 import torch
 import yaml
+from rsl_rl.utils import resolve_callable
 
 from mjlab.rl.learners import acting_cfg
-from mjlab.rl.rsl import resolve_callable
 from mjlab.scripts.policy import _agent_cfg, constant_policy
 from mjlab.tasks.registry import load_rl_cfg
 

@@ -316,7 +316,7 @@ def _cells(line: str) -> list[str]:
 
 
 def test_the_page_of_the_documentation_is_that_of_the_data(module):
-    assert (ROOT / "docs" / "reference" / "index.md").read_text() == module.page(DATA)
+    assert (ROOT / "docs" / "reference" / "runs" / "index.md").read_text() == module.page(DATA)
 
 
 def test_only_what_is_asked_for_is_replaced(maker):

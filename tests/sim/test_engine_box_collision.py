@@ -181,7 +181,7 @@ def test_flat_boxes_meet_at_the_same_points_of_which_warp_keeps_four(depth):
             assert np.linalg.norm(places - contact.pos, axis=1).min() < 1e-5
             np.testing.assert_allclose(contact.normal, mine[0].normal, atol=1e-5)
             np.testing.assert_allclose(contact.parameters, mine[0].parameters, rtol=1e-6)
-    # Once this fails, the engines agree, and docs/engines.md should say so.
+    # Once this fails, the engines agree, and docs/explanation/engines.md should say so.
     assert fewer > 0
 
 

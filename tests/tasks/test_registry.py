@@ -179,7 +179,7 @@ def test_a_learner_is_chosen_by_name():
     assert load_rl_cfg("Test", learner="ppo") == load_rl_cfg("Test")
     assert load_rl_cfg("Test", learner="sac") == RslRlOffPolicyRunnerCfg()
     unknown: Any = "td3"
-    with pytest.raises(ValueError, match=r"'td3'\. Available: ppo, sac, distillation\."):
+    with pytest.raises(ValueError, match="'td3'.*'ppo', 'sac', 'distillation'"):
         load_rl_cfg("Test", learner=unknown)
 
 

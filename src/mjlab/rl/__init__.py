@@ -6,9 +6,13 @@ command lines read, comes without torch.
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 from mjlab.utils.lazy import lazy_names
+
+# GitPython, which rsl_rl's logger imports, fails at import where there is no `git` to run.
+os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
 
 if TYPE_CHECKING:
     from mjlab.rl.config import EvaluationCfg as EvaluationCfg

@@ -27,15 +27,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 
 from mjlab.rl.learners import Learner
-from mjlab.rl.rsl import TensorDict
 from mjlab.utils.errors import MjlabError
 from mjlab.utils.os import replacing
 from mjlab.utils.random import rng_state, set_rng_state
 
 if TYPE_CHECKING:
-    from mjlab.rl.rsl import VecEnv
+    from rsl_rl.env import VecEnv
 
 logger = logging.getLogger(__name__)
 
@@ -145,7 +145,12 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
     path = Path(path)
     if not path.is_file():
-        raise CheckpointError(_missing_message(path))
+        folder = path if path.is_dir() else path.parent
+        found = sorted(other.name for other in folder.glob("*.pt"))
+        raise CheckpointError(
+            f"Checkpoint {str(path)!r}: expected a file, found {'a folder' if path == folder else 'none'}. "
+            f"Available in {str(folder)!r}: {found}."
+        )
     try:
         with warnings.catch_warnings():
             # About pickle protocols, which say nothing to a user.
@@ -157,7 +162,17 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
                         raise zipfile.BadZipFile(f"the checksum of {damaged} is wrong")
             data = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
-        raise CheckpointError(_unpickling_message(path, error)) from error
+        called = re.search(r"(?:GLOBAL|class|function) ([\w.]+)", str(error))
+        reason, hint = "it is not a file of torch, or is corrupt", ""
+        if called is not None:
+            reason = f"it wants to call {called[1]!r}, and a checkpoint may hold data only"
+            hint = (
+                " Do not use this file unless you trust where it comes from; weights can be saved "
+                "again with torch.save({...: state_dict()})."
+            )
+        raise CheckpointError(
+            f"The checkpoint {str(path)!r} was refused: {reason}. Nothing in it was run.{hint}"
+        ) from error
     except Exception as error:
         # Damaged bytes make the reader fail in any way there is.
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:160]
@@ -215,31 +230,6 @@ def ensure_writable_folder(folder: str | os.PathLike[str]) -> Path:
             "Choose another place with --log-root, or change its permissions."
         ) from error
     return folder
-
-
-def _missing_message(path: Path) -> str:
-    if path.is_dir():
-        return f"{str(path)!r} is a folder; give a checkpoint file such as 'model_100.pt' in it."
-    if not path.parent.is_dir():
-        return f"There is no checkpoint {str(path)!r}: its folder does not exist."
-    others = sorted(other.name for other in path.parent.glob("*.pt"))
-    found = f"Checkpoints in that folder: {others}." if others else "Its folder has none."
-    return f"There is no checkpoint {str(path)!r}. {found}"
-
-
-def _unpickling_message(path: Path, error: Exception) -> str:
-    forbidden = re.search(r"GLOBAL ([\w.]+)|class ([\w.]+)|function ([\w.]+)", str(error))
-    if forbidden is None:
-        return (
-            f"The checkpoint {str(path)!r} was refused: it is not a file of torch, or is corrupt. "
-            "Nothing in it was run."
-        )
-    name = next(group for group in forbidden.groups() if group)
-    return (
-        f"The checkpoint {str(path)!r} was refused: it wants to call {name!r}, and a checkpoint "
-        "may hold data only. Nothing in it was run. Do not use this file unless you trust where "
-        "it comes from; weights can be saved again with torch.save({...: state_dict()})."
-    )
 
 
 class RunRescue:
@@ -377,7 +367,11 @@ def check_fits(
     found = {key: tuple(value.shape) for key, value in saved.items() if hasattr(value, "shape")}
     if expected == found:
         # What a network is built with, such as a mask of minus infinity, may be in its checkpoint.
-        broken = [key for key in own if not _is_finite(saved[key]) and _is_finite(own[key])]
+        broken = [
+            key
+            for key, value in own.items()
+            if value.isfinite().all() and not saved[key].isfinite().all()
+        ]
         if broken:
             raise CheckpointError(
                 f"The checkpoint {path!r} holds {name} weights that are NaN or infinite: "
@@ -454,10 +448,6 @@ def not_finite(value: Any, name: str = "") -> list[str]:
         return []
     prefix = f"{name}." if name else ""
     return [found for key, item in items for found in not_finite(item, f"{prefix}{key}")]
-
-
-def _is_finite(value: torch.Tensor) -> bool:
-    return bool(torch.isfinite(value).all())
 
 
 # Exact resume.

@@ -17,6 +17,15 @@ def gaussian_distribution(init_std: float = 1.0) -> dict[str, Any]:
     return {"class_name": "GaussianDistribution", "init_std": init_std, "std_type": "scalar"}
 
 
+def squashed_gaussian(init_std: float = 0.15, log_std_max: float = 0.0) -> dict[str, Any]:
+    """Return a `distribution_cfg`: normal, through tanh, with deviations that the network gives."""
+    return {
+        "class_name": "mjlab.rl.sac_models:SquashedGaussian",
+        "init_std": init_std,
+        "log_std_range": (-5.0, log_std_max),
+    }
+
+
 @accepts_older_fields
 @dataclass
 class RslRlModelCfg:
@@ -162,6 +171,29 @@ class RslRlSacAlgorithmCfg:
 
 
 @dataclass
+class RslRlDistillationAlgorithmCfg:
+    """Imitation of a teacher on the states that the student leads to (DAgger; arXiv 1011.0686)."""
+
+    num_learning_epochs: int = 1
+    """Passes over the data of an iteration."""
+    gradient_length: int = 8
+    """Environment steps for one update; a recurrent student learns through as many. It should divide
+    epochs times steps of an iteration: what is left over teaches nothing."""
+    learning_rate: float = 1e-3
+    """Learning rate."""
+    max_grad_norm: float | None = 1.0
+    """Gradients are scaled down to this norm; None leaves them."""
+    loss_type: Literal["mse", "huber"] = "mse"
+    """Distance between the actions of student and teacher."""
+    optimizer: Literal["adam", "adamw", "sgd", "rmsprop"] = "adam"
+    """Optimizer."""
+    use_mixed_precision: bool = False
+    """Mixed precision: bfloat16 in the networks while learning."""
+    class_name: str = "Distillation"
+    """A class of rsl_rl, or `module:Class`."""
+
+
+@dataclass
 class EvaluationCfg:
     """What counts as solved, and when training stops to look.
 
@@ -279,26 +311,30 @@ class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
 
 
 @dataclass
-class RslRlDistillationAlgorithmCfg:
-    """Imitation of a teacher on the states that the student leads to (DAgger; arXiv 1011.0686)."""
+class RslRlOffPolicyRunnerCfg(RslRlBaseRunnerCfg):
+    """A training run with an off-policy algorithm. Actions are in (-1, 1)."""
 
-    num_learning_epochs: int = 1
-    """Passes over the data of an iteration."""
-    gradient_length: int = 8
-    """Environment steps for one update; a recurrent student learns through as many. It should divide
-    epochs times steps of an iteration: what is left over teaches nothing."""
-    learning_rate: float = 1e-3
-    """Learning rate."""
-    max_grad_norm: float | None = 1.0
-    """Gradients are scaled down to this norm; None leaves them."""
-    loss_type: Literal["mse", "huber"] = "mse"
-    """Distance between the actions of student and teacher."""
-    optimizer: Literal["adam", "adamw", "sgd", "rmsprop"] = "adam"
-    """Optimizer."""
-    use_mixed_precision: bool = False
-    """Mixed precision: bfloat16 in the networks while learning."""
-    class_name: str = "Distillation"
-    """A class of rsl_rl, or `module:Class`."""
+    actor: RslRlModelCfg = field(
+        default_factory=lambda: RslRlModelCfg(
+            class_name="mjlab.rl.sac_models:SacActorModel",
+            hidden_dims=(256, 128, 64),
+            activation="swish",
+            obs_normalization=True,
+            distribution_cfg=squashed_gaussian(),
+        )
+    )
+    """The policy network."""
+    critic: RslRlModelCfg = field(
+        default_factory=lambda: RslRlModelCfg(
+            class_name="mjlab.rl.sac_models:TwinCriticModel",
+            hidden_dims=(256, 128, 64),
+            activation="swish",
+            obs_normalization=True,
+        )
+    )
+    """Both critics."""
+    algorithm: RslRlSacAlgorithmCfg = field(default_factory=RslRlSacAlgorithmCfg)
+    """The learning algorithm."""
 
 
 @dataclass
@@ -325,39 +361,3 @@ class RslRlDistillationRunnerCfg(RslRlBaseRunnerCfg):
     """Checkpoint of the teacher, trained with PPO. A resumed run has its teacher already."""
     torch_compile_mode: TorchCompileMode | None = None
     """Networks compiled by `torch.compile`, which takes its time at the start; None does not."""
-
-
-def squashed_gaussian(init_std: float = 0.15, log_std_max: float = 0.0) -> dict[str, Any]:
-    """Return a `distribution_cfg`: normal, through tanh, with deviations that the network gives."""
-    return {
-        "class_name": "mjlab.rl.sac_models:SquashedGaussian",
-        "init_std": init_std,
-        "log_std_range": (-5.0, log_std_max),
-    }
-
-
-@dataclass
-class RslRlOffPolicyRunnerCfg(RslRlBaseRunnerCfg):
-    """A training run with an off-policy algorithm. Actions are in (-1, 1)."""
-
-    actor: RslRlModelCfg = field(
-        default_factory=lambda: RslRlModelCfg(
-            class_name="mjlab.rl.sac_models:SacActorModel",
-            hidden_dims=(256, 128, 64),
-            activation="swish",
-            obs_normalization=True,
-            distribution_cfg=squashed_gaussian(),
-        )
-    )
-    """The policy network."""
-    critic: RslRlModelCfg = field(
-        default_factory=lambda: RslRlModelCfg(
-            class_name="mjlab.rl.sac_models:TwinCriticModel",
-            hidden_dims=(256, 128, 64),
-            activation="swish",
-            obs_normalization=True,
-        )
-    )
-    """Both critics."""
-    algorithm: RslRlSacAlgorithmCfg = field(default_factory=RslRlSacAlgorithmCfg)
-    """The learning algorithm."""

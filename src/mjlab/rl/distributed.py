@@ -36,7 +36,7 @@ from mjlab.utils.processes import (
     cores_per_process,
     process_rank,
 )
-from mjlab.utils.signals import FORWARDED, not_ignored, replace_handlers, restore_handlers
+from mjlab.utils.signals import FORWARDED, handled_signals
 
 T = TypeVar("T")
 
@@ -83,8 +83,15 @@ def launch_workers(
     shared |= {"WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count)}
     shared.setdefault("OMP_NUM_THREADS", str(max(1, cores_per_process() // count)))
     workers: list[subprocess.Popen[bytes]] = []
+    received: list[signal.Signals] = []
     killed = set()
-    with _forwarding_signals(workers) as received:
+
+    def forward(number: int, frame: FrameType | None) -> None:
+        received.append(FORWARDED[number])
+        for worker in workers:
+            worker.send_signal(FORWARDED[number])
+
+    with handled_signals(forward, FORWARDED):
         for rank in range(count):
             own = {**shared, "RANK": str(rank), "LOCAL_RANK": str(rank)}
             # A session of its own: a terminal sends Ctrl-C to all processes of its session, and a
@@ -295,25 +302,6 @@ class ProcessOutput(io.TextIOBase):
 
 
 # Helpers of launching and joining.
-
-
-@contextlib.contextmanager
-def _forwarding_signals(
-    workers: list[subprocess.Popen[bytes]],
-) -> Generator[list[signal.Signals]]:
-    """Send `workers` the signals that would end this process; yield those that have arrived."""
-    received: list[signal.Signals] = []
-
-    def forward(number: int, frame: FrameType | None) -> None:
-        received.append(FORWARDED[number])
-        for worker in workers:
-            worker.send_signal(FORWARDED[number])
-
-    previous = replace_handlers(forward, not_ignored(FORWARDED))
-    try:
-        yield received
-    finally:
-        restore_handlers(previous)
 
 
 def _running(workers: list[subprocess.Popen[bytes]]) -> list[int]:

@@ -95,7 +95,13 @@ class RolloutWatch:
         except (DivergedError, BrokenTermError):
             raise
         except (RuntimeError, ValueError) as error:
-            message = self._explanation() if _is_about_numbers(error, policy) else None
+            # NaN in the distribution of actions, in a step or in the policy.
+            tensors = (
+                t for t in (*policy.parameters(), *policy.buffers()) if t.is_floating_point()
+            )
+            comes_from_nan = any(text in str(error) for text in ("elements of std >= 0", "NaN"))
+            comes_from_nan = comes_from_nan or any(not t.isfinite().all() for t in tensors)
+            message = self._explanation() if comes_from_nan else None
             if message is None:
                 raise
             raise DivergedError(
@@ -122,12 +128,3 @@ class RolloutWatch:
             f"{describe_dof(model, dof, speeds[dof])}, too fast for a timestep of "
             f"{float(model.opt.timestep):g} s. {cure_of(model, dof)}"
         )
-
-
-def _is_about_numbers(error: Exception, policy: torch.nn.Module) -> bool:
-    """Return whether an error comes from NaN: in the action distribution, the policy or a step."""
-    said = str(error)
-    if "elements of std >= 0" in said or "NaN" in said:
-        return True
-    tensors = [*policy.parameters(), *policy.buffers()]
-    return any(t.is_floating_point() and not bool(torch.isfinite(t).all()) for t in tensors)

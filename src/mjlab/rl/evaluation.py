@@ -26,6 +26,7 @@ import torch
 
 from mjlab.utils.errors import check_positive
 from mjlab.utils.random import evaluation_seed, preserved_rng
+from mjlab.utils.string import suggest
 from mjlab.utils.torch import threads_for_policy
 
 if TYPE_CHECKING:
@@ -116,12 +117,11 @@ def evaluate_policy(
     ):
         for first in range(0, num_episodes, env.num_envs):
             count = min(env.num_envs, num_episodes - first)
-            record = _Recorder(env, count, success_func, metrics or {})
             # Commands that take turns, such as motions, go through them over all rounds.
             manager: Any = getattr(env.unwrapped, "command_manager", None)
             for name in manager.active_terms if manager is not None else ():
                 manager.get_term(name).take_turns_from(first)
-            rounds.append(_play_round(env, policy, record, max_steps))
+            rounds.append(_play_round(env, policy, count, max_steps, success_func, metrics or {}))
     episodes = functools.reduce(operator.add, rounds)
     successes = episodes.succeeded if success_func is not None else None
     if successes is None and success_is_survival:
@@ -225,9 +225,7 @@ class EvaluationResult:
         value = getattr(self, name, None) if name in FIGURES else None
         if value is None:
             known = [*self.metrics, *(f for f in FIGURES if getattr(self, f) is not None)]
-            raise ValueError(
-                f"An evaluation of this task has no figure {name!r}; it has {', '.join(known)}."
-            )
+            raise ValueError(f"Evaluation of this task: no figure {name!r}; {suggest(name, known)}")
         return float(value)
 
     def judged(self, name: str) -> float:
@@ -285,10 +283,19 @@ class SolvedCheck:
         for name in (*self._below, *self._above):
             if name not in known:
                 raise ValueError(
-                    f"EvaluationCfg: solved_below or solved_above names {name!r}, which is not "
-                    f"measured. Add it to `metrics`, or take one of {', '.join(sorted(known))}."
+                    f"EvaluationCfg solved_below, solved_above: {name!r} is not measured; "
+                    f"{suggest(name, sorted(known))} Others must be in `metrics`."
                 )
-        _warn_of_few_episodes(self._below, self._above, self._num_episodes)
+        # Bounds on rates that so few episodes never meet, even if none of them fails.
+        allowed = {"failure_rate": self._below.get("failure_rate", 1.0)}
+        allowed["success_rate"] = 1.0 - self._above.get("success_rate", 0.0)
+        for name, failures in allowed.items():
+            if failures > 0.0 and self._num_episodes < (needed := episodes_to_show(failures)):
+                logger.warning(
+                    "EvaluationCfg: %d episodes never meet the bound on %s, because they say too little "
+                    "of failures as rare as %.3g %%; use num_episodes >= %d.",
+                    self._num_episodes, name, 100.0 * failures, needed,
+                )  # fmt: skip
         self._eval_env: Any = None
         self.last_iteration = 0
 
@@ -389,21 +396,6 @@ class SolvedCheck:
             self._eval_env = None
 
 
-def _warn_of_few_episodes(
-    below: dict[str, float], above: dict[str, float], num_episodes: int
-) -> None:
-    """Warn of bounds on rates that so few episodes never meet, even if none of them fails."""
-    allowed = {"failure_rate": below.get("failure_rate", 1.0)}
-    allowed["success_rate"] = 1.0 - above.get("success_rate", 0.0)
-    for name, failures in allowed.items():
-        if failures > 0.0 and num_episodes < (needed := episodes_to_show(failures)):
-            logger.warning(
-                "EvaluationCfg: %d episodes never meet the bound on %s, because they say too little "
-                "of failures as rare as %.3g %%; use num_episodes >= %d.",
-                num_episodes, name, 100.0 * failures, needed,
-            )  # fmt: skip
-
-
 def success_definition(cfg: EvaluationCfg) -> str | None:
     """Return what makes an episode a success, or None where the task does not say.
 
@@ -496,79 +488,58 @@ def _undisturbed(env: RslRlVecEnvWrapper) -> Generator[None]:
 
 
 def _play_round(
-    env: RslRlVecEnvWrapper, policy: Policy, record: _Recorder, max_steps: int
+    env: RslRlVecEnvWrapper,
+    policy: Policy,
+    count: int,
+    max_steps: int,
+    success_func: PerEnv | None,
+    metrics: Mapping[str, PerEnv],
 ) -> Episodes:
-    """Record the first episode of each environment that `record` looks at."""
+    """Play the first episode of each of the first `count` environments."""
+    unwrapped = env.unwrapped
+
+    def zeros(dtype: torch.dtype) -> torch.Tensor:
+        return torch.zeros(env.num_envs, dtype=dtype, device=env.device)
+
+    running = ~zeros(torch.bool)
+    running[count:] = False
+    returns, lengths = zeros(torch.float64), zeros(torch.long)
+    failed, succeeded = zeros(torch.bool), zeros(torch.bool)
+    sums = {name: zeros(torch.float64) for name in metrics}
+    manager: Any = getattr(unwrapped, "termination_manager", None)
+    terminations = {name: zeros(torch.bool) for name in (manager.active_terms if manager else ())}
     reset_policy = getattr(policy, "reset", None)
     observations, _ = env.reset()
     if reset_policy is not None:
         reset_policy()
     for step in range(max_steps):
-        record.before_step()
+        if success_func is not None:
+            succeeded = torch.where(running, success_func(unwrapped).bool(), succeeded)
+        for name, func in metrics.items():
+            # Not multiplied, because zero times infinity would be NaN.
+            sums[name] += torch.where(running, func(unwrapped), 0.0)
         observations, rewards, dones, _ = env.step(policy(observations).to(env.device))
-        record.after_step(rewards, dones != 0)
+        returns += rewards * running
+        lengths += running
+        ended = running & (dones != 0)
+        failed |= ended & unwrapped.reset_terminated
+        for name, ended_by in terminations.items():
+            ended_by |= ended & manager.get_term(name)
+        running &= dones == 0
         if reset_policy is not None:
             reset_policy(dones)
-        if (step + 1) % _STEPS_BETWEEN_CHECKS == 0 and not record.running.any():
+        if (step + 1) % _STEPS_BETWEEN_CHECKS == 0 and not running.any():
             break
-    return record.episodes()
-
-
-class _Recorder:
-    """Takes down the first episode of the first `count` environments."""
-
-    def __init__(
-        self,
-        env: RslRlVecEnvWrapper,
-        count: int,
-        success_func: PerEnv | None,
-        metrics: Mapping[str, PerEnv],
-    ) -> None:
-        self._env, self._count = env, count
-        self._success_func, self._metrics = success_func, metrics
-
-        def zeros(dtype: torch.dtype) -> torch.Tensor:
-            return torch.zeros(env.num_envs, dtype=dtype, device=env.device)
-
-        self.running = ~zeros(torch.bool)
-        self.running[count:] = False
-        self._returns, self._lengths = zeros(torch.float64), zeros(torch.long)
-        self._failed, self._succeeded = zeros(torch.bool), zeros(torch.bool)
-        self._sums = {name: zeros(torch.float64) for name in metrics}
-        self._terminations: Any = getattr(env.unwrapped, "termination_manager", None)
-        names = self._terminations.active_terms if self._terminations else ()
-        self._ended_by = {name: zeros(torch.bool) for name in names}
-
-    def before_step(self) -> None:
-        unwrapped = self._env.unwrapped
-        if self._success_func is not None:
-            value = self._success_func(unwrapped).bool()
-            self._succeeded = torch.where(self.running, value, self._succeeded)
-        for name, func in self._metrics.items():
-            # Not multiplied, because zero times infinity would be NaN.
-            self._sums[name] += torch.where(self.running, func(unwrapped), 0.0)
-
-    def after_step(self, rewards: torch.Tensor, dones: torch.Tensor) -> None:
-        self._returns += rewards * self.running
-        self._lengths += self.running
-        ended = self.running & dones
-        self._failed |= ended & self._env.unwrapped.reset_terminated
-        for name, ended_by in self._ended_by.items():
-            ended_by |= ended & self._terminations.get_term(name)
-        self.running &= ~dones
-
-    def episodes(self) -> Episodes:
-        first = slice(self._count)
-        lengths = self._lengths[first]
-        return Episodes(
-            returns=self._returns[first] / reward_unit(self._env),
-            lengths=lengths,
-            finished=~self.running[first] | (lengths >= int(self._env.max_episode_length)),
-            failed=self._failed[first],
-            succeeded=self._succeeded[first],
-            terminations={name: value[first] for name, value in self._ended_by.items()},
-            metrics={name: total[first] / lengths for name, total in self._sums.items()},
-        )
+    first = slice(count)
+    return Episodes(
+        returns=returns[first] / reward_unit(env),
+        lengths=lengths[first],
+        finished=~running[first] | (lengths[first] >= int(env.max_episode_length)),
+        failed=failed[first],
+        succeeded=succeeded[first],
+        terminations={name: ended_by[first] for name, ended_by in terminations.items()},
+        metrics={name: total[first] / lengths[first] for name, total in sums.items()},
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

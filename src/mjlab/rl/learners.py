@@ -16,16 +16,10 @@ from mjlab.rl.config import (
 from mjlab.utils.errors import check_exists
 
 Learner = Literal["ppo", "sac", "distillation"]
-LEARNERS: tuple[Learner, ...] = get_args(Learner)
 
 _MIRROR_FUNCTION = "data_augmentation_func"
 # Fields of a run whose values suit one learner only.
 _PACE = frozenset(("num_steps_per_env", "max_iterations", "save_interval"))
-
-
-def check_learner(name: str) -> None:
-    """Raise ValueError, listing the learners, unless `name` is one."""
-    check_exists("learner", name, LEARNERS)
 
 
 def learner_of(cfg: RslRlBaseRunnerCfg) -> Learner:
@@ -46,12 +40,27 @@ def with_learner(cfg: RslRlBaseRunnerCfg, learner: Learner) -> RslRlBaseRunnerCf
         ValueError: the learner is unknown; or is SAC, and a network of `cfg` is recurrent or has an
             image encoder; or is distillation, and `cfg` is not one of PPO.
     """
-    check_learner(learner)
+    check_exists("learner", learner, get_args(Learner))
     if learner_of(cfg) == learner:
         return cfg
     base = _shared_fields(cfg, learner)
     if learner == "distillation":
-        return _distillation(cfg, base)
+        if learner_of(cfg) != "ppo":
+            raise ValueError(
+                f"distillation: expected a teacher of the learner 'ppo', got one of "
+                f"{learner_of(cfg)!r}; use another profile, or none."
+            )
+        teacher: RslRlModelCfg = copy.deepcopy(getattr(cfg, "actor", RslRlModelCfg()))
+        groups = cfg.obs_groups.get("actor", ("actor",))
+        made = RslRlDistillationRunnerCfg(**base)
+        made.obs_groups = {"student": groups, "teacher": groups}
+        steps = made.num_steps_per_env
+        made.algorithm.gradient_length = max(k for k in range(1, 9) if steps % k == 0)
+        made.teacher = teacher
+        made.student = replace(
+            copy.deepcopy(teacher), distribution_cfg=made.student.distribution_cfg
+        )
+        return made
     symmetry = getattr(getattr(cfg, "algorithm", None), "symmetry_cfg", None)
     if learner == "sac":
         for name in ("actor", "critic"):
@@ -74,23 +83,6 @@ def with_learner(cfg: RslRlBaseRunnerCfg, learner: Learner) -> RslRlBaseRunnerCf
     return on_policy
 
 
-def _distillation(cfg: RslRlBaseRunnerCfg, base: dict[str, Any]) -> RslRlDistillationRunnerCfg:
-    if learner_of(cfg) != "ppo":
-        raise ValueError(
-            f"distillation: expected a teacher of the learner 'ppo', got one of {learner_of(cfg)!r}; use "
-            "another profile, or none."
-        )
-    teacher: RslRlModelCfg = copy.deepcopy(getattr(cfg, "actor", RslRlModelCfg()))
-    groups = cfg.obs_groups.get("actor", ("actor",))
-    made = RslRlDistillationRunnerCfg(**base)
-    made.obs_groups = {"student": groups, "teacher": groups}
-    steps = made.num_steps_per_env
-    made.algorithm.gradient_length = max(k for k in range(1, 9) if steps % k == 0)
-    made.teacher = teacher
-    made.student = replace(copy.deepcopy(teacher), distribution_cfg=made.student.distribution_cfg)
-    return made
-
-
 def for_task_of(cfg: RslRlBaseRunnerCfg, other: RslRlBaseRunnerCfg) -> RslRlBaseRunnerCfg:
     """Return a copy of `cfg` with what `other` says of the task, such as its evaluation.
 
@@ -104,6 +96,14 @@ def for_task_of(cfg: RslRlBaseRunnerCfg, other: RslRlBaseRunnerCfg) -> RslRlBase
     return cfg
 
 
+def acting_cfg(cfg: RslRlBaseRunnerCfg) -> dict[str, Any]:
+    """Return `cfg` as the dict of a runner that acts and does not learn: with the least replay."""
+    acting = asdict(cfg)
+    if learner_of(cfg) == "sac":
+        acting["algorithm"]["replay_steps"] = 1
+    return acting
+
+
 def _shared_fields(cfg: RslRlBaseRunnerCfg, learner: Learner) -> dict[str, Any]:
     """Return copies of the fields of `cfg` that a config of `learner` has too.
 
@@ -115,11 +115,3 @@ def _shared_fields(cfg: RslRlBaseRunnerCfg, learner: Learner) -> dict[str, Any]:
     if (learner_of(cfg) == "distillation") != (learner == "distillation"):
         del shared["obs_groups"]
     return shared
-
-
-def acting_cfg(cfg: RslRlBaseRunnerCfg) -> dict[str, Any]:
-    """Return `cfg` as the dict of a runner that acts and does not learn: with the least replay."""
-    acting = asdict(cfg)
-    if learner_of(cfg) == "sac":
-        acting["algorithm"]["replay_steps"] = 1
-    return acting

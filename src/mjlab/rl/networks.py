@@ -11,8 +11,12 @@ from collections.abc import Generator, Mapping
 from typing import Any
 
 import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import CNNModel, MLPModel, RNNModel
+from rsl_rl.modules import CNN
+from rsl_rl.utils import resolve_callable
+from tensordict import TensorDict
 
-from mjlab.rl.rsl import CNN, PPO, CNNModel, MLPModel, RNNModel, TensorDict, resolve_callable
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
 from mjlab.rl.spatial_softmax import SPATIAL_SOFTMAX_KEYS, cnn_cfg_by_group
 from mjlab.utils.errors import check_positive

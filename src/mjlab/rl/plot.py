@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mjlab.utils.string import suggest
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -36,7 +38,7 @@ def read_scalars(run_dir: str | Path, tag: str) -> Curve:
     """
     curves = read_all_scalars(run_dir)
     if tag not in curves:
-        raise ValueError(f"The run {str(run_dir)!r} has no figure {tag!r}. Figures: {[*curves]}.")
+        raise ValueError(f"Run {str(run_dir)!r}: no figure {tag!r}; {suggest(tag, curves)}")
     return curves[tag]
 
 

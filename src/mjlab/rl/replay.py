@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 
 from mjlab.rl.checkpoint import load_checkpoint, save_checkpoint
-from mjlab.rl.rsl import TensorDict
 from mjlab.utils.errors import check_count
 
 logger = logging.getLogger(__name__)

@@ -1,4 +1,4 @@
-"""The log of a run: TensorBoard events (and Weights & Biases on request), episode statistics."""
+"""Log of a run: events for TensorBoard or Weights & Biases, observers, and the state of the code."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ import logging
 import math
 import os
 import statistics
+import subprocess
 import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from rsl_rl.utils.logger import Logger
 
 from mjlab.rl.checkpoint import ensure_writable_folder
-from mjlab.rl.git_diff import write_git_diff
-from mjlab.rl.rsl import Logger, enable_wandb
+from mjlab.utils.os import replacing
 
 if TYPE_CHECKING:
     from mjlab.rl.evaluation import EvaluationResult
@@ -26,6 +27,8 @@ logger = logging.getLogger(__name__)
 
 # What the config may also call a service, as rsl_rl's classes.
 _LOGGER_TYPES = {"WandbLogWriter": "wandb", "NeptuneLogWriter": "neptune"}
+# Folders of installed packages.
+_INSTALLED = ("site-packages", "dist-packages")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,23 +181,20 @@ class RunLogger(Logger):
                 self.cfg["logger"] = wanted
                 self.git_status_repos = sources
         if self.log_dir is not None and not self.disable_logs:
-            self._keep_code_state(Path(self.log_dir))
+            keeps_diff = self.cfg.get("save_git_diff", True)
+            for source in self.git_status_repos if keeps_diff else ():
+                diff = write_git_diff(Path(self.log_dir), Path(source))
+                if diff is not None and self.cfg.get("upload_git_diff", False):
+                    # TensorBoard's writer uploads nothing.
+                    getattr(self.writer, "save_file", lambda path: None)(str(diff))
+            # rsl_rl makes the folder in any case.
+            with contextlib.suppress(OSError):
+                Path(self.log_dir, "git").rmdir()
         for line in filter(None, printed.getvalue().splitlines()):
             logger.debug("%s", line)
         if self.writer is not None and threading.excepthook != self._on_thread_error:
             self._thread_hook = threading.excepthook
             threading.excepthook = self._on_thread_error
-
-    def _keep_code_state(self, run_dir: Path) -> None:
-        if self.cfg.get("save_git_diff", True):
-            for source in self.git_status_repos:
-                diff = write_git_diff(run_dir, Path(source))
-                if diff is not None and self.cfg.get("upload_git_diff", False):
-                    # TensorBoard's writer uploads nothing.
-                    getattr(self.writer, "save_file", lambda path: None)(str(diff))
-        # rsl_rl makes the folder in any case.
-        with contextlib.suppress(OSError):
-            (run_dir / "git").rmdir()
 
     def process_env_step(
         self,
@@ -278,61 +278,6 @@ class RunLogger(Logger):
                 "large. It is not logged again.", stats.iteration, ", ".join(broken),
             )  # fmt: skip
 
-    def _collect_finished_episodes(self) -> None:
-        if not self._finished:
-            return
-        done, *sums = (torch.stack(column) for column in zip(*self._finished, strict=True))
-        self._finished.clear()
-        for (_, last), of_steps in zip(self._episode_sums, sums, strict=True):
-            last.extend(of_steps[done].tolist())
-
-    def _mean_step_reward(self) -> float:
-        if not self._step_rewards:
-            return 0.0
-        mean = torch.stack(self._step_rewards).mean().item()
-        self._step_rewards.clear()
-        return mean / self._reward_unit
-
-    def _environment_means(self) -> dict[str, float]:
-        values: dict[str, list[torch.Tensor]] = {}
-        for step in self.ep_extras:
-            for name, value in step.items():
-                tensor = torch.as_tensor(value, dtype=torch.float32, device=self.device)
-                values.setdefault(name, []).append(tensor.flatten())
-        self.ep_extras.clear()
-        if not values:
-            return {}
-        means = torch.stack([torch.cat(parts).mean() for parts in values.values()]).tolist()
-        names = [name if "/" in name else f"Episode/{name}" for name in values]
-        return dict(zip(names, means, strict=True))
-
-    def _write(self, stats: IterationStats, iteration: int, rnd_weight: float | None) -> None:
-        scalars = {
-            **stats.environment,
-            **{f"Loss/{name}": value for name, value in stats.losses.items()},
-            "Loss/learning_rate": stats.learning_rate,
-            "Policy/mean_std": stats.action_std,
-            "Perf/total_fps": int(stats.steps_per_second),
-            "Perf/collection_time": stats.collection_time,
-            "Perf/learning_time": stats.learning_time,
-            "Train/mean_step_reward": stats.mean_step_reward,
-        }
-        over_time = {}
-        if stats.mean_reward is not None and stats.mean_episode_length is not None:
-            scalars["Train/mean_reward"] = stats.mean_reward
-            scalars["Train/mean_episode_length"] = stats.mean_episode_length
-            # Weights & Biases has one count of steps, and a time axis of its own.
-            if self.logger_type != "wandb":
-                over_time["Train/mean_reward/time"] = stats.mean_reward
-                over_time["Train/mean_episode_length/time"] = stats.mean_episode_length
-            if self._uses_rnd:
-                scalars["Rnd/mean_extrinsic_reward"] = statistics.fmean(self.erewbuffer)
-                scalars["Rnd/mean_intrinsic_reward"] = statistics.fmean(self.irewbuffer)
-        if rnd_weight is not None:
-            scalars["Rnd/weight"] = rnd_weight
-        self.write_scalars(scalars, iteration)
-        self.write_scalars(over_time, int(self.tot_time))
-
     def write_scalars(self, scalars: dict[str, float], step: int) -> None:
         """Write `scalars` at `step` (usually the iteration) to the event file, if there is one.
 
@@ -345,19 +290,6 @@ class RunLogger(Logger):
                 self.writer.add_scalar(tag, value, step)
         except OSError as error:
             self._stop_writing(error)
-
-    def _stop_writing(self, error: BaseException | None) -> None:
-        if not self._write_failed:
-            self._write_failed = True
-            logger.warning("Figures are no longer written to %s: %s", self.log_dir, error)
-
-    def _on_thread_error(self, args: threading.ExceptHookArgs) -> None:
-        # TensorBoard writes in a thread, whose traceback would come before the error that it causes.
-        is_writer = type(args.thread).__module__.startswith("tensorboard.")
-        if is_writer and issubclass(args.exc_type, OSError):
-            self._stop_writing(args.exc_value)
-        else:
-            self._thread_hook(args)
 
     def write_evaluation(
         self, result: EvaluationResult, iteration: int, group: str = "Evaluation"
@@ -429,14 +361,127 @@ class RunLogger(Logger):
         self.rewbuffer.extend(state["rewards"])
         self.lenbuffer.extend(state["lengths"])
 
+    def _collect_finished_episodes(self) -> None:
+        if not self._finished:
+            return
+        done, *sums = (torch.stack(column) for column in zip(*self._finished, strict=True))
+        self._finished.clear()
+        for (_, last), of_steps in zip(self._episode_sums, sums, strict=True):
+            last.extend(of_steps[done].tolist())
+
+    def _mean_step_reward(self) -> float:
+        if not self._step_rewards:
+            return 0.0
+        mean = torch.stack(self._step_rewards).mean().item()
+        self._step_rewards.clear()
+        return mean / self._reward_unit
+
+    def _environment_means(self) -> dict[str, float]:
+        values: dict[str, list[torch.Tensor]] = {}
+        for step in self.ep_extras:
+            for name, value in step.items():
+                tensor = torch.as_tensor(value, dtype=torch.float32, device=self.device)
+                values.setdefault(name, []).append(tensor.flatten())
+        self.ep_extras.clear()
+        if not values:
+            return {}
+        means = torch.stack([torch.cat(parts).mean() for parts in values.values()]).tolist()
+        names = [name if "/" in name else f"Episode/{name}" for name in values]
+        return dict(zip(names, means, strict=True))
+
+    def _write(self, stats: IterationStats, iteration: int, rnd_weight: float | None) -> None:
+        scalars = {
+            **stats.environment,
+            **{f"Loss/{name}": value for name, value in stats.losses.items()},
+            "Loss/learning_rate": stats.learning_rate,
+            "Policy/mean_std": stats.action_std,
+            "Perf/total_fps": int(stats.steps_per_second),
+            "Perf/collection_time": stats.collection_time,
+            "Perf/learning_time": stats.learning_time,
+            "Train/mean_step_reward": stats.mean_step_reward,
+        }
+        over_time = {}
+        if stats.mean_reward is not None and stats.mean_episode_length is not None:
+            scalars["Train/mean_reward"] = stats.mean_reward
+            scalars["Train/mean_episode_length"] = stats.mean_episode_length
+            # Weights & Biases has one count of steps, and a time axis of its own.
+            if self.logger_type != "wandb":
+                over_time["Train/mean_reward/time"] = stats.mean_reward
+                over_time["Train/mean_episode_length/time"] = stats.mean_episode_length
+            if self._uses_rnd:
+                scalars["Rnd/mean_extrinsic_reward"] = statistics.fmean(self.erewbuffer)
+                scalars["Rnd/mean_intrinsic_reward"] = statistics.fmean(self.irewbuffer)
+        if rnd_weight is not None:
+            scalars["Rnd/weight"] = rnd_weight
+        self.write_scalars(scalars, iteration)
+        self.write_scalars(over_time, int(self.tot_time))
+
+    def _stop_writing(self, error: BaseException | None) -> None:
+        if not self._write_failed:
+            self._write_failed = True
+            logger.warning("Figures are no longer written to %s: %s", self.log_dir, error)
+
+    def _on_thread_error(self, args: threading.ExceptHookArgs) -> None:
+        # TensorBoard writes in a thread, whose traceback would come before the error that it causes.
+        is_writer = type(args.thread).__module__.startswith("tensorboard.")
+        if is_writer and issubclass(args.exc_type, OSError):
+            self._stop_writing(args.exc_value)
+        else:
+            self._thread_hook(args)
+
+
+def write_git_diff(run_dir: Path, source: Path) -> Path | None:
+    """Write the state of the repository that `source` is in to `git/<repository>.diff`.
+
+    Says so if there are uncommitted changes in it. Returns the file; None if it is there already, or
+    if `source` is in no repository, such as that of an installed package.
+    """
+    # A virtual environment within a checkout is not part of it.
+    if any(part in _INSTALLED for part in source.parts):
+        return None
+    root = _git(source.parent, "rev-parse", "--show-toplevel").strip()
+    commit = _git(source.parent, "rev-parse", "--verify", "HEAD").strip()
+    path = run_dir / "git" / f"{Path(root).name}.diff"
+    if not root or not commit or path.exists():
+        return None
+    status, diff = _git(Path(root), "status"), _git(Path(root), "diff", "--no-ext-diff", "HEAD")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = (
+        f"--- git commit ---\n{commit}\n\n\n--- git status ---\n{status} \n\n\n--- git diff ---\n"
+    )
+    with replacing(path) as file:
+        file.write((text + diff).encode(errors="replace"))
+    if diff:
+        logger.info(
+            "Uncommitted changes of %s are kept in %s; --agent.save-git-diff False leaves them out.",
+            root,
+            path,
+        )
+    return path
+
 
 def _writer_config(wanted: str | dict[str, Any], cfg: dict[str, Any]) -> str | dict[str, Any]:
     """Return what rsl_rl makes the writer from."""
     if wanted == "wandb":
         wanted = {"class_name": "WandbLogWriter", "project_name": cfg.get("wandb_project")}
-    if isinstance(wanted, dict) and wanted.get("class_name") == "WandbLogWriter":
-        enable_wandb()
-        if not cfg.get("upload_git_diff", False):
-            # wandb makes a difference of its own, of the repository around the working folder.
-            os.environ.setdefault("WANDB_DISABLE_CODE", "true")
+    is_wandb = isinstance(wanted, dict) and wanted.get("class_name") == "WandbLogWriter"
+    if is_wandb and not cfg.get("upload_git_diff", False):
+        # wandb makes a difference of its own, of the repository around the working folder.
+        os.environ.setdefault("WANDB_DISABLE_CODE", "true")
     return wanted
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    """Return what git prints; nothing if it fails, or is not installed."""
+    try:
+        told = subprocess.run(
+            ["git", *arguments],
+            cwd=folder,
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            env={**os.environ, "GIT_OPTIONAL_LOCKS": "0"},
+        )
+    except OSError:
+        return ""
+    return told.stdout if told.returncode == 0 else ""

@@ -18,6 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.env import VecEnv
+from rsl_rl.runners import OnPolicyRunner
+from rsl_rl.utils import check_nan
+from tensordict import TensorDict
 
 from mjlab.rl.checkpoint import (
     RunRescue,
@@ -40,15 +45,6 @@ from mjlab.rl.networks import (
     shared_parameters_allowed,
 )
 from mjlab.rl.replay import ReplayFiles, ReplayStorage
-from mjlab.rl.rsl import (
-    PPO,
-    OnPolicyRunner,
-    TensorDict,
-    VecEnv,
-    check_nan,
-    enable_torch_compile,
-    keep_compiler_out_of_step,
-)
 from mjlab.rl.run_logger import RunLogger, TrainingObserver
 from mjlab.utils.processes import process_rank
 from mjlab.utils.random import seed_rng, session_seed
@@ -95,15 +91,11 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 `symmetry_cfg` has no function that makes mirror images.
         """
         prepare_train_cfg(env, train_cfg)
-        if train_cfg.get("torch_compile_mode"):
-            enable_torch_compile()
         # rsl_rl prints networks and observation sets.
         with contextlib.redirect_stdout(io.StringIO()) as printed, shared_parameters_allowed():
             super().__init__(env, train_cfg, log_dir, device)
         logger.debug("%s", printed.getvalue().rstrip())
         deduplicate_parameters(self.alg.optimizer)
-        if not train_cfg.get("torch_compile_mode"):
-            keep_compiler_out_of_step(self.alg.optimizer)
         self.logger: RunLogger = RunLogger(
             log_dir=log_dir,
             cfg=self.cfg,
@@ -316,26 +308,21 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         final = extras["final_observations"].to(self.device)
         ids = extras["final_ids"].to(self.device)
         time_outs = extras["time_outs"].to(self.device)
+        # Not the compiled critic, which would be compiled for each number of time-outs.
+        critic = self.alg._raw_critic
+        if critic.is_recurrent:
+            # The hidden state is of all environments, and has seen the observations before the step.
+            hidden_state = critic.get_hidden_state()
+            everywhere = observations.clone()
+            everywhere[ids] = final
+            values = critic(everywhere)[ids]
+            critic.reset(hidden_state=hidden_state)
+        else:
+            values = critic(final)
         # A wrapper may have found that an episode terminated after all.
-        values = self._final_values(observations, final, ids) * time_outs[ids]
+        values = values.detach().squeeze(-1) * time_outs[ids]
         rewards = rewards.index_add(0, ids, (self.alg.gamma * values).to(rewards.dtype))
         return rewards, {**extras, "time_outs": time_outs.index_fill(0, ids, False)}
-
-    def _final_values(
-        self, observations: TensorDict, final: TensorDict, ids: torch.Tensor
-    ) -> torch.Tensor:
-        """Return the critic's values (k,) of `final`, observations of the environments `ids`."""
-        # Compiled models would be compiled for each k.
-        critic = self.alg._raw_critic
-        if not critic.is_recurrent:
-            return critic(final).detach().squeeze(-1)
-        # The hidden state is of all environments, and has seen the observations before the step.
-        hidden_state = critic.get_hidden_state()
-        everywhere = observations.clone()
-        everywhere[ids] = final
-        values = critic(everywhere).detach().squeeze(-1)[ids]
-        critic.reset(hidden_state=hidden_state)
-        return values
 
     def _update(self) -> dict[str, float]:
         """Learn from what was collected; return the losses.

@@ -14,24 +14,25 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
-
-from mjlab.rl.replay import Batch, ReplayStorage
-from mjlab.rl.rsl import (
-    TensorDict,
-    VecEnv,
+from rsl_rl.env import VecEnv
+from rsl_rl.utils import (
     reduce_gradients_in_buckets,
     resolve_callable,
     resolve_class,
     resolve_obs_groups,
 )
-from mjlab.rl.sac_models import SacActorModel, SquashedGaussian, TwinCriticModel
+from tensordict import TensorDict
+from torch import nn
+
+from mjlab.rl.config import RslRlSacAlgorithmCfg
+from mjlab.rl.replay import ReplayStorage
+from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
 
 # Of returns whose scale is estimated, where no range of values is given.
 _SCALED_RANGE = (-5.0, 5.0)
@@ -54,100 +55,100 @@ class SAC:
         actor: SacActorModel,
         critic: TwinCriticModel,
         storage: ReplayStorage,
-        num_envs: int,
+        env: VecEnv,
+        cfg: RslRlSacAlgorithmCfg,
         *,
-        gamma: float,
-        num_steps_return: int,
-        tau: float,
-        batch_size: int,
-        num_updates: int,
-        policy_delay: int,
-        learning_starts: int,
-        actor_learning_rate: float,
-        critic_learning_rate: float,
-        weight_decay: float,
-        init_alpha: float,
-        alpha_learning_rate: float,
-        alpha_range: tuple[float, float],
-        target_std: float,
-        pessimistic: bool,
-        mean_penalty: float,
-        policy_average: float,
-        noise_hold: int,
-        scales_rewards: bool,
-        teacher: str | None = None,
-        teacher_steps: int = 0,
-        imitation: Sequence[tuple[int, float]] = ((0, 0.0),),
-        mirror: Any = None,
-        env: Any = None,
-        use_mixed_precision: bool = False,
-        learns_beside_physics: bool = False,
         device: str = "cpu",
         multi_gpu_cfg: dict | None = None,
         grad_reduce_bucket_mb: float = 25,
     ) -> None:
-        if mirror is not None and batch_size % 2:
-            raise ValueError(
-                f"SAC batch_size: expected an even number, because half of it are mirror images, got "
-                f"{batch_size}."
-            )
-        self.device = device
+        """Take networks, replay, environments and settings.
+
+        Raises:
+            ValueError: a setting does not fit another one.
+        """
+        self.cfg, self.device, self.storage = cfg, device, storage
         self.actor, self.critic = actor.to(device), critic.to(device)
         self._raw_actor, self._raw_critic = self.actor, self.critic
         # Acts, and is what others see: it changes between two environment steps only.
         self._policy = copy.deepcopy(self.actor).requires_grad_(False)
         self._target = copy.deepcopy(self.critic).requires_grad_(False)
-        self.storage = storage
-        self.gamma, self._num_steps_return, self._tau = gamma, num_steps_return, tau
-        self._batch_size, self._num_updates = batch_size, num_updates
-        self._policy_delay, self._learning_starts = policy_delay, learning_starts
-        self._pessimistic, self._mean_penalty = pessimistic, mean_penalty
-        self._policy_average = policy_average
-        self._log_alpha = nn.Parameter(torch.tensor(math.log(init_alpha), device=device))
-        self._log_alpha_range = (math.log(alpha_range[0]), math.log(alpha_range[1]))
-        num_actions = _of(actor).output_dim
-        self._target_entropy = num_actions * math.log(target_std * math.sqrt(2 * math.pi * math.e))
-        groups = [
-            {"params": list(self.critic.parameters()), "lr": critic_learning_rate},
-            {"params": list(self.actor.parameters()), "lr": actor_learning_rate},
-            {"params": [self._log_alpha], "lr": alpha_learning_rate, "weight_decay": 0.0},
-        ]
+        self._log_alpha = nn.Parameter(torch.tensor(math.log(cfg.init_alpha), device=device))
         # Fused: one call for all parameters, a quarter of the time. The second moments forget sooner
         # than usual, because targets move (arXiv 2512.01996).
         self.optimizer = torch.optim.AdamW(
-            groups, betas=(0.9, 0.95), weight_decay=weight_decay, fused=True
+            [
+                {"params": list(self.critic.parameters()), "lr": cfg.critic_learning_rate},
+                {"params": list(self.actor.parameters()), "lr": cfg.actor_learning_rate},
+                {"params": [self._log_alpha], "lr": cfg.alpha_learning_rate, "weight_decay": 0.0},
+            ],
+            betas=(0.9, 0.95),
+            weight_decay=cfg.weight_decay,
+            fused=True,
         )
-        self.learning_rate = actor_learning_rate
-        steps = [step for step, _ in imitation]
-        if not steps or steps != sorted(set(steps)):
-            raise ValueError(f"SAC imitation: expected points with rising steps, got {imitation}.")
-        if teacher is None and (teacher_steps > 0 or any(weight for _, weight in imitation)):
+        self.learning_rate = cfg.actor_learning_rate
+        self._teacher = _Teacher(cfg)
+        symmetry, self._env = cfg.symmetry_cfg, env
+        self._mirror = resolve_callable(symmetry["data_augmentation_func"]) if symmetry else None
+        if self._mirror is not None and cfg.batch_size % 2:
             raise ValueError(
-                "SAC teacher_steps, imitation: expected 0 without a teacher; set teacher to the group of "
-                "observations that shows its actions."
+                f"SAC batch_size: expected an even number, because half of it are mirror images, got "
+                f"{cfg.batch_size}."
             )
-        self._teacher, self._teacher_steps = teacher, teacher_steps
-        self._imitation_steps, self._imitation_weights = zip(*imitation, strict=True)
-        self._mirror, self._env = mirror, env
-        self._use_mixed_precision = use_mixed_precision
         self._multi_gpu, self._bucket_mb = multi_gpu_cfg, grad_reduce_bucket_mb
 
         self._generator = torch.Generator(device=device)
         self._generator.manual_seed(torch.initial_seed() % 2**63)
-        self._noise = _HeldNoise(num_envs, num_actions, noise_hold, device)
-        self._reward_scale = _ReturnScale(num_envs, gamma, device) if scales_rewards else None
+        self._noise = _HeldNoise(env.num_envs, env.num_actions, cfg.noise_hold, device)
+        scales = cfg.value_range is None
+        self._reward_scale = _ReturnScale(env.num_envs, cfg.gamma, device) if scales else None
         self._num_steps = self._num_updates_made = 0
-        self._actions = torch.zeros(num_envs, num_actions, device=device)
+        self._actions = torch.zeros(env.num_envs, env.num_actions, device=device)
         self._started = False
         # Of updates that are waited for, and of those before.
         self._figures: list[dict[str, torch.Tensor]] = []
         self._finished: list[dict[str, torch.Tensor]] = []
-        self._beside_physics = learns_beside_physics
         self._thread: ThreadPoolExecutor | None = None
         self._running: Future[None] | None = None
-        if learns_beside_physics:
+        self._beside_physics = multi_gpu_cfg is None and torch.device(device).type == "cpu"
+        if self._beside_physics:
             # For the thread that acts. More would wait for those of the physics.
             self.num_threads = 1
+
+    @staticmethod
+    def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict, device: str) -> SAC:
+        """Build networks and replay from a `RslRlOffPolicyRunnerCfg` as a dict."""
+        alg_class, further = resolve_class(cfg["algorithm"])
+        # A subclass takes its further settings by keyword.
+        own = {field.name for field in fields(RslRlSacAlgorithmCfg)} & further.keys()
+        alg_cfg = RslRlSacAlgorithmCfg(**{name: further.pop(name) for name in own})
+        actor_class, actor_cfg = resolve_class(cfg["actor"])
+        critic_class, critic_cfg = resolve_class(cfg["critic"])
+        cfg["obs_groups"] = resolve_obs_groups(obs, cfg["obs_groups"], ["actor", "critic"])
+        actor = actor_class(obs, cfg["obs_groups"], "actor", env.num_actions, **actor_cfg)
+        critic = critic_class(
+            obs,
+            cfg["obs_groups"],
+            "critic",
+            env.num_actions,
+            num_atoms=alg_cfg.num_atoms,
+            value_range=alg_cfg.value_range or _SCALED_RANGE,
+            **critic_cfg,
+        )
+        groups = list(dict.fromkeys([*actor.obs_groups, *critic.obs_groups]))
+        if (teacher := alg_cfg.teacher) is not None:
+            shape = tuple(obs[teacher].shape[1:]) if teacher in obs else None
+            if shape != (env.num_actions,):
+                raise ValueError(
+                    f"SAC teacher: expected an observation group of {env.num_actions} numbers, one for "
+                    f"each action, got {teacher!r}, of shape {shape}; groups are {sorted(obs.keys())}."
+                )
+            groups.append(teacher)
+        storage = ReplayStorage(alg_cfg.replay_steps, obs.to(device), groups, env.num_actions)
+        multi_gpu = cfg["multi_gpu"]
+        return alg_class(
+            actor, critic, storage, env, alg_cfg, device=device, multi_gpu_cfg=multi_gpu, **further
+        )
 
     # Acting.
 
@@ -159,14 +160,13 @@ class SAC:
                 # A checkpoint has the state of the first process, and each draws batches of its own.
                 self._generator.manual_seed(int(torch.randint(2**62, ())))
             self._started = True
-        distribution = _of(self._policy)
+        distribution = self._policy.distribution
         distribution.update(self._policy.mlp(self._policy.get_latent(obs)))
         noise = self._noise.draw()
         self._actions = distribution.action_of(noise)
-        if self._teacher is not None and self._num_steps < self._teacher_steps:
-            shown = obs[self._teacher]
-            near = torch.tanh(torch.atanh(shown) + distribution.std * noise)
-            self._actions = torch.where(_has_opinion(shown), near, self._actions)
+        if self._num_steps < self.cfg.teacher_steps:
+            noise = distribution.std * noise
+            self._actions = self._teacher.act(obs, noise, self._actions)
         return self._actions
 
     def process_env_step(
@@ -193,11 +193,11 @@ class SAC:
             for own, learned in zip(
                 self._policy.parameters(), self.actor.parameters(), strict=True
             ):
-                own.lerp_(learned, self._policy_average)
+                own.lerp_(learned, self.cfg.policy_average)
             for own, learned in zip(self._policy.buffers(), self.actor.buffers(), strict=True):
                 own.copy_(learned)
         self._num_steps += 1
-        if self._num_steps < self._learning_starts:
+        if self._num_steps < self.cfg.learning_starts:
             return
         if self._beside_physics:
             if self._thread is None:
@@ -218,40 +218,17 @@ class SAC:
             for name in sorted(set().union(*figures))
         }
 
-    def _wait(self) -> None:
-        """Wait until what is being learned is learned; raise what went wrong with it."""
-        running, self._running = self._running, None
-        if running is not None:
-            running.result()
-        self._finished += self._figures
-        self._figures = []
-
-    def close(self) -> None:
-        """Finish learning, and end the thread in which it happens; another step starts one again."""
-        self._wait()
-        if self._thread is not None:
-            self._thread.shutdown()
-            self._thread = None
-
     # Learning.
 
     def _learn(self) -> None:
         """Make the updates of one environment step, from one sample of the replay."""
-        parts = 1 if self._mirror is None else 2
-        size = self._num_updates * self._batch_size // parts
-        batch = self.storage.sample(size, self.gamma, self._num_steps_return, self._generator)
-        if self._reward_scale is not None:
-            batch.returns *= self._reward_scale.factor
-        inputs = self._prepare(batch)
-        for rows in torch.arange(size * parts, device=self.device).view(
-            parts, self._num_updates, -1
-        ).transpose(0, 1).flatten(1):  # fmt: skip
-            self._update({name: value[rows] for name, value in inputs.items()})
-
-    def _prepare(self, batch: Batch) -> dict[str, torch.Tensor]:
-        """Return what updates need of a batch, with mirror images appended, observations normalized."""
+        cfg, parts = self.cfg, 1 if self._mirror is None else 2
+        size = cfg.num_updates * cfg.batch_size // parts
+        batch = self.storage.sample(size, cfg.gamma, cfg.num_steps_return, self._generator)
         before, after, actions = batch.observations, batch.next_observations, batch.actions
-        weights, returns, discounts = batch.weights, batch.returns, batch.discounts
+        returns, discounts, weights = batch.returns, batch.discounts, batch.weights
+        if self._reward_scale is not None:
+            returns = returns * self._reward_scale.factor
         if self._mirror is not None:
             before, actions = self._mirror(env=self._env, obs=before, actions=actions)
             after, _ = self._mirror(env=self._env, obs=after, actions=None)
@@ -259,9 +236,7 @@ class SAC:
                 value.repeat(2) for value in (returns, discounts, weights)
             )
         with torch.no_grad():
-            taught = {} if self._teacher is None else {"teacher": before[self._teacher]}
-            return {
-                **taught,
+            inputs = {
                 "actor": self.actor.get_latent(before),
                 "critic": self.critic.get_latent(before),
                 "next_actor": self.actor.get_latent(after),
@@ -271,23 +246,30 @@ class SAC:
                 "discounts": discounts,
                 "weights": weights,
             }
+        if self._teacher.weight(self._num_steps) > 0.0:
+            inputs["teacher"] = before[self._teacher.group]
+        # Each update takes transitions together with their mirror images.
+        for rows in torch.arange(size * parts, device=self.device).view(
+            parts, cfg.num_updates, -1
+        ).transpose(0, 1).flatten(1):  # fmt: skip
+            self._update({name: value[rows] for name, value in inputs.items()})
 
     def _update(self, inputs: dict[str, torch.Tensor]) -> None:
         self.optimizer.zero_grad(set_to_none=True)
         figures = self._critic_gradients(inputs)
         self._num_updates_made += 1
-        if self._num_updates_made % self._policy_delay == 0:
+        if self._num_updates_made % self.cfg.policy_delay == 0:
             figures |= self._actor_gradients(inputs)
         if self._multi_gpu is not None:
             parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
             reduce_gradients_in_buckets(parameters, self._multi_gpu["world_size"], self._bucket_mb)
         self.optimizer.step()
         with torch.no_grad():
-            self._log_alpha.clamp_(*self._log_alpha_range)
+            self._log_alpha.clamp_(*map(math.log, self.cfg.alpha_range))
             for target, source in zip(
                 self._target.parameters(), self.critic.parameters(), strict=True
             ):
-                target.lerp_(source, self._tau)
+                target.lerp_(source, self.cfg.tau)
         self._figures.append(figures)
 
     def _critic_gradients(self, inputs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
@@ -295,7 +277,7 @@ class SAC:
         with torch.no_grad(), self._autocast():
             actions, log_prob = self._sample(inputs["next_actor"])
             values = self._target.values(inputs["next_critic"], actions)
-            value = values.amin(dim=0) if self._pessimistic else values.mean(dim=0)
+            value = values.amin(dim=0) if self.cfg.pessimistic else values.mean(dim=0)
             value = value - self._log_alpha.exp() * log_prob
             target = inputs["returns"] + inputs["discounts"] * value
             wanted = self.critic.distribution_of(target)
@@ -318,23 +300,22 @@ class SAC:
         with self._autocast():
             actions, log_prob = self._sample(inputs["actor"])
             values = self.critic.values(inputs["critic"], actions)
-        value = values.amin(dim=0) if self._pessimistic else values.mean(dim=0)
+        value = values.amin(dim=0) if self.cfg.pessimistic else values.mean(dim=0)
         loss = (self._log_alpha.exp().detach() * log_prob - value).mean()
-        distribution = _of(self.actor)
+        distribution = self.actor.distribution
         # Of actions that are seldom tried, critics know least. Without this, those of joints that
         # matter little drift to their bounds, where tanh has no gradient that would lead back.
-        loss = loss + self._mean_penalty * distribution.params[0].square().sum(dim=-1).mean()
+        loss = loss + self.cfg.mean_penalty * distribution.params[0].square().sum(dim=-1).mean()
         figures = {}
         if "teacher" in inputs:
             # On states that the policy itself leads to (DAgger; Ross et al., arXiv 1011.0686).
-            shown = inputs["teacher"]
-            difference = torch.where(_has_opinion(shown), distribution.mean - shown, 0.0)
-            distance = difference.square().sum(dim=-1).mean()
-            weight = np.interp(self._num_steps, self._imitation_steps, self._imitation_weights)
-            loss = loss + float(weight) * distance
+            distance = self._teacher.distance(inputs["teacher"], distribution.mean)
+            loss = loss + self._teacher.weight(self._num_steps) * distance
             figures["imitation"] = distance.detach()
         entropy = distribution.entropy.detach().mean()
-        alpha_loss = self._log_alpha.exp() * (entropy - self._target_entropy)
+        # Of a normal distribution with deviation `target_std` in each action.
+        wanted = math.log(self.cfg.target_std * math.sqrt(2 * math.pi * math.e))
+        alpha_loss = self._log_alpha.exp() * (entropy - distribution.output_dim * wanted)
         # Not for the critic, whose gradients are those of its own loss.
         loss.backward(inputs=list(self.actor.parameters()))
         alpha_loss.backward()
@@ -346,7 +327,7 @@ class SAC:
         }
 
     def _sample(self, latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        distribution = _of(self.actor)
+        distribution = self.actor.distribution
         distribution.update(self.actor.mlp(latent))
         noise = torch.randn(
             (len(latent), distribution.output_dim), generator=self._generator, device=self.device
@@ -355,7 +336,15 @@ class SAC:
 
     def _autocast(self) -> torch.autocast:
         kind = torch.device(self.device).type
-        return torch.autocast(kind, torch.bfloat16, enabled=self._use_mixed_precision)
+        return torch.autocast(kind, torch.bfloat16, enabled=self.cfg.use_mixed_precision)
+
+    def _wait(self) -> None:
+        """Wait until what is being learned is learned; raise what went wrong with it."""
+        running, self._running = self._running, None
+        if running is not None:
+            running.result()
+        self._finished += self._figures
+        self._figures = []
 
     # Modes, files, processes.
 
@@ -369,6 +358,13 @@ class SAC:
         self._wait()
         self.actor.eval()
         self.critic.eval()
+
+    def close(self) -> None:
+        """Finish learning, and end the thread in which it happens; another step starts one again."""
+        self._wait()
+        if self._thread is not None:
+            self._thread.shutdown()
+            self._thread = None
 
     def get_policy(self) -> SacActorModel:
         """Return the policy that acts."""
@@ -427,53 +423,6 @@ class SAC:
         for model in (self.actor, self.critic, self._policy, self._target):
             for tensor in model.state_dict().values():
                 torch.distributed.broadcast(tensor, src=0)
-
-    @staticmethod
-    def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict, device: str) -> SAC:
-        """Build networks and replay from a `RslRlOffPolicyRunnerCfg` as a dict."""
-        alg_class, alg_cfg = resolve_class(cfg["algorithm"])
-        actor_class, actor_cfg = resolve_class(cfg["actor"])
-        critic_class, critic_cfg = resolve_class(cfg["critic"])
-        cfg["obs_groups"] = resolve_obs_groups(obs, cfg["obs_groups"], ["actor", "critic"])
-        actor = actor_class(obs, cfg["obs_groups"], "actor", env.num_actions, **actor_cfg)
-        value_range = alg_cfg.pop("value_range")
-        critic = critic_class(
-            obs,
-            cfg["obs_groups"],
-            "critic",
-            env.num_actions,
-            num_atoms=alg_cfg.pop("num_atoms"),
-            value_range=value_range or _SCALED_RANGE,
-            **critic_cfg,
-        )
-        groups = list(dict.fromkeys([*actor.obs_groups, *critic.obs_groups]))
-        if (teacher := alg_cfg["teacher"]) is not None:
-            shape = tuple(obs[teacher].shape[1:]) if teacher in obs else None
-            if shape != (env.num_actions,):
-                raise ValueError(
-                    f"SAC teacher: expected an observation group of {env.num_actions} numbers, one for "
-                    f"each action, got {teacher!r}, of shape {shape}; groups are {sorted(obs.keys())}."
-                )
-            groups.append(teacher)
-        steps = alg_cfg.pop("replay_steps")
-        storage = ReplayStorage(steps, obs.to(device), groups, env.num_actions)
-        symmetry = alg_cfg.pop("symmetry_cfg")
-        mirror = resolve_callable(symmetry["data_augmentation_func"]) if symmetry else None
-        alone = cfg["multi_gpu"] is None
-        alg_cfg.pop("save_replay")
-        return alg_class(
-            actor,
-            critic,
-            storage,
-            env.num_envs,
-            mirror=mirror,
-            env=env,
-            scales_rewards=value_range is None,
-            learns_beside_physics=alone and torch.device(device).type == "cpu",
-            device=device,
-            multi_gpu_cfg=cfg["multi_gpu"],
-            **alg_cfg,
-        )
 
 
 class _HeldNoise:
@@ -547,12 +496,38 @@ class _ReturnScale:
                 setattr(self, name, value.to(own.device).clone())
 
 
-def _has_opinion(shown: torch.Tensor) -> torch.Tensor:
-    """Return which actions a teacher shows, (N, A): those within the range of actions."""
-    return shown.abs() < 1.0
+class _Teacher:
+    """A controller that acts at first, and that the policy imitates.
 
+    The observation group `group` shows its actions. Those outside (-1, 1) leave the policy free.
+    """
 
-def _of(model: SacActorModel) -> SquashedGaussian:
-    distribution = model.distribution
-    assert isinstance(distribution, SquashedGaussian)
-    return distribution
+    def __init__(self, cfg: RslRlSacAlgorithmCfg) -> None:
+        steps = [step for step, _ in cfg.imitation]
+        if not steps or steps != sorted(set(steps)):
+            raise ValueError(
+                f"SAC imitation: expected points with rising steps, got {cfg.imitation}."
+            )
+        weighs = any(weight for _, weight in cfg.imitation)
+        if cfg.teacher is None and (cfg.teacher_steps > 0 or weighs):
+            raise ValueError(
+                "SAC teacher_steps, imitation: expected 0 without a teacher; set teacher to the group of "
+                "observations that shows its actions."
+            )
+        self.group = cfg.teacher
+        self._steps, self._weights = zip(*cfg.imitation, strict=True)
+
+    def act(self, obs: TensorDict, noise: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """Return the controller's actions with `noise` before tanh; `actions` where it has none."""
+        shown: Any = obs[self.group]
+        near = torch.tanh(torch.atanh(shown) + noise)
+        return torch.where(shown.abs() < 1.0, near, actions)
+
+    def weight(self, num_steps: int) -> float:
+        """Return the weight of `distance` after `num_steps` environment steps."""
+        return float(np.interp(num_steps, self._steps, self._weights))
+
+    def distance(self, shown: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
+        """Return the mean squared distance of `mean` (B, A) from the actions `shown` (B, A)."""
+        difference = torch.where(shown.abs() < 1.0, mean - shown, 0.0)
+        return difference.square().sum(dim=-1).mean()

@@ -13,9 +13,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.modules.distribution import Distribution
+from rsl_rl.utils import resolve_nn_activation
+from tensordict import TensorDict
 from torch import nn
-
-from mjlab.rl.rsl import Distribution, MLPModel, TensorDict, resolve_nn_activation
 
 _LOG_2PI = math.log(2.0 * math.pi)
 
@@ -136,14 +138,22 @@ def normalized_mlp(
 class SacActorModel(MLPModel):
     """Policy network: rsl_rl's, with normalized layers."""
 
+    distribution: SquashedGaussian  # ty: ignore[incompatible-mutable-override]
+
     def __init__(self, *args: Any, hidden_dims: Sequence[int], activation: str, **kwargs: Any):
-        """Take the arguments of rsl_rl's `MLPModel`."""
+        """Take the arguments of rsl_rl's `MLPModel`.
+
+        Raises:
+            ValueError: the distribution is not a `SquashedGaussian`.
+        """
         super().__init__(*args, hidden_dims=tuple(hidden_dims), activation=activation, **kwargs)
-        distribution = self.distribution
-        assert isinstance(distribution, SquashedGaussian)
-        inputs, outputs = self._get_latent_dim(), distribution.input_dim
+        if not isinstance(self.distribution, SquashedGaussian):
+            raise ValueError(
+                f"SAC distribution_cfg: expected a SquashedGaussian, got {self.distribution}."
+            )
+        inputs, outputs = self._get_latent_dim(), self.distribution.input_dim
         self.mlp = normalized_mlp(inputs, outputs, hidden_dims, activation)
-        distribution.init_mlp_weights(self.mlp)
+        self.distribution.init_mlp_weights(self.mlp)
 
 
 class TwinCriticModel(MLPModel):

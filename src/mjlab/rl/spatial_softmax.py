@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from rsl_rl.models import CNNModel
+from rsl_rl.modules import CNN
+from tensordict import TensorDict
 from torch import nn
-
-from mjlab.rl.rsl import CNN, CNNModel, TensorDict
 
 SPATIAL_SOFTMAX_KEYS = ("spatial_softmax", "spatial_softmax_temperature")
 """Keys of a CNN config that are not for rsl_rl's CNN."""

@@ -6,8 +6,9 @@ import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
 
-from mjlab.rl.rsl import TensorDict, VecEnv
 from mjlab.utils.errors import check_positive
 from mjlab.utils.spaces import batch_space
 

@@ -16,7 +16,7 @@ from mjlab.scripts.flags import is_given
 from mjlab.scripts.run_folder import read_run_info, run_folders
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.processes import PARENT_VARIABLE
-from mjlab.utils.signals import FORWARDED, not_ignored, replace_handlers, restore_handlers
+from mjlab.utils.signals import FORWARDED, handled_signals
 
 _SEEDS_HELP = "--seeds N    Train with the seeds 1, 2, ..., N, one after the other (default: 5)."
 
@@ -101,8 +101,7 @@ def run_forwarding_signals(command: list[str], seconds: float | None = None) -> 
         else:
             child.send_signal(FORWARDED[number])
 
-    previous = replace_handlers(forward, not_ignored(FORWARDED))
-    try:
+    with handled_signals(forward, FORWARDED):
         # A session of its own, because a terminal sends Ctrl-C to all processes of its session,
         # and a second signal tells training to stop at once.
         child = subprocess.Popen(
@@ -119,8 +118,6 @@ def run_forwarding_signals(command: list[str], seconds: float | None = None) -> 
             if not stopped:
                 child.send_signal(signal.SIGINT)
             return child.wait(), stopped
-    finally:
-        restore_handlers(previous)
 
 
 def plot_command(argv: list[str], prog: str) -> None:

@@ -205,10 +205,8 @@ def load_rl_cfg(
         UnknownTaskError, UnknownProfileError, TaskImportError: see `load_env_cfg`.
         ValueError: the learner is unknown, or cannot have the observations that the task's has.
     """
-    from mjlab.rl.learners import check_learner, for_task_of, learner_of, with_learner
+    from mjlab.rl.learners import for_task_of, learner_of, with_learner
 
-    if learner is not None:
-        check_learner(learner)
     if profile is None:
         cfg = given = _made(task_name, _find(task_name).rl_cfg)
     else:

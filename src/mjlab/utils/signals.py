@@ -87,6 +87,21 @@ class StopRequest:
 
 
 @contextlib.contextmanager
+def handled_signals(
+    handle: Callable[[int, FrameType | None], None], numbers: Iterable[int]
+) -> Generator[None]:
+    """Call `handle` for the signals `numbers` within the block, then restore the handlers.
+
+    Ignored signals, such as SIGHUP under `nohup`, stay ignored.
+    """
+    previous = replace_handlers(handle, not_ignored(numbers))
+    try:
+        yield
+    finally:
+        restore_handlers(previous)
+
+
+@contextlib.contextmanager
 def first_interrupt_calls(callback: Callable[[], None], enabled: bool) -> Generator[None]:
     """Let the first Ctrl+C call `callback`, and a second one interrupt as usual."""
 

@@ -15,7 +15,7 @@ from mjlab.asset_zoo.robots import get_go1_robot_cfg
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.tasks.registry import load_rl_cfg
 
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "velocity.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "guides" / "velocity.md"
 
 
 @pytest.fixture

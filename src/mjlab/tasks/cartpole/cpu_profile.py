@@ -1,4 +1,4 @@
-"""The `cpu` profile of the cartpole swing-up. `docs/learning.md` has the experiments."""
+"""The `cpu` profile of the cartpole swing-up. `docs/guides/learning.md` has the experiments."""
 
 from __future__ import annotations
 

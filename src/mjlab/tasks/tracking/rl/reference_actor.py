@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from rsl_rl.models import MLPModel
 from torch import nn
 
 from mjlab.envs import mdp
-from mjlab.rl.rsl import MLPModel
 from mjlab.tasks.tracking.mdp.commands import MotionCommand
 
 _NEARLY_NOTHING = 0.01

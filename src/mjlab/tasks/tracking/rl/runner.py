@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from rsl_rl.env import VecEnv
 
 from mjlab.rl.exporter_utils import export_to_onnx
-from mjlab.rl.rsl import VecEnv
 from mjlab.rl.runner import ExportingOnPolicyRunner
 from mjlab.tasks.tracking.mdp.commands import MotionCommand
 from mjlab.tasks.tracking.mdp.motion_sampling import HardSegmentSampler

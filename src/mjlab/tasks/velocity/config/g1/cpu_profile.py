@@ -1,7 +1,7 @@
 """The `cpu` profile of the G1's velocity tasks: a humanoid that learns to walk on two cores.
 
 PPO does not get there in an hour, so the learner is the off-policy one (`mjlab.rl.sac`), and the task is
-made easier to learn, not easier to pass. `docs/learning.md` has the experiments.
+made easier to learn, not easier to pass. `docs/guides/learning.md` has the experiments.
 
 - A controller from a textbook steps in place (`stepping_action`). It acts for the first 60 environment steps, and the
   policy imitates it, less and less, for the first 1,200 of some 3,000. Without it, policies learn to stand and

@@ -1,0 +1,226 @@
+"""Draw the pictures of the documentation: `python tools/make_pictures.py`.
+
+It renders offscreen and needs no display. Run it again when a terrain preset or the example of
+`variants.md` changes.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import mujoco
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from PIL import Image
+
+from mjlab.scene import Scene, SceneCfg
+from mjlab.sensor import CameraSensorCfg
+from mjlab.sim import Simulation, SimulationCfg
+from mjlab.tasks.registry import load_env_cfg
+from mjlab.terrains import SubTerrainCfg, TerrainEntityCfg, TerrainGenerator, TerrainGeneratorCfg
+from mjlab.terrains.config import ALL_TERRAIN_PRESETS
+from mjlab.viewer.offscreen_renderer import OffscreenRenderer, open_renderer
+from mjlab.viewer.viewer_config import ViewerConfig
+from mjlab.viewer.viser.camera_viewer import depth_colors, segmentation_colors
+
+_DOCS = Path(__file__).parents[1] / "docs"
+_IMAGES = _DOCS / "images"
+
+# Extent of one terrain, in metres, and how difficult those of a strip are.
+_SIZE = 8.0
+_DIFFICULTIES = (0.0, 0.5, 1.0)
+_STRIPS_PER_ROW = 2
+# Pixels of a strip and of its title. Strips are rendered larger, and shrunk to smooth edges.
+_WIDTH, _HEIGHT, _TITLE, _OVERSAMPLING = 640, 168, 22, 2
+
+
+def main() -> None:
+    """Draw all pictures."""
+    draw_terrains(_IMAGES / "terrains.png")
+    draw_variants(_IMAGES / "variants.png")
+    draw_cameras(_IMAGES / "cameras.png")
+
+
+def draw_cameras(path: Path) -> None:
+    """Draw what cameras of both engines see of the arm that lifts a cube, one engine a row."""
+    figure = Figure(figsize=(9.6, 3.4), dpi=100)
+    engines: tuple[Literal["native", "warp"], ...] = ("native", "warp")
+    for row, engine in enumerate(engines):
+        pictures = camera_pictures(engine)
+        for column, (title, pixels) in enumerate(pictures.items()):
+            left, width = (0.025 + 0.1625 * column, 0.158)
+            axes = figure.add_axes((left, 0.485 - 0.475 * row, width, 0.45), xticks=[], yticks=[])
+            axes.imshow(pixels, interpolation="nearest")
+            if row == 0:
+                axes.set_title(title, fontsize=9, pad=3)
+            if column == 0:
+                axes.set_ylabel(engine, fontsize=10, labelpad=4)
+    figure.savefig(path)
+    Image.open(path).convert("RGB").save(path, optimize=True)
+    print(f"{path}: {path.stat().st_size // 1024} kB")
+
+
+def camera_pictures(engine: Literal["native", "warp"]) -> dict[str, np.ndarray]:
+    """Return the images (H, W, 3) of two cameras, by what they show."""
+    task = load_env_cfg("Mjlab-Lift-Cube-Yam-Rgb").scene
+    kinds = ("rgb", "depth", "segmentation")
+    common: dict[str, Any] = {"width": 144, "height": 144, "data_types": kinds}
+    common["enabled_geom_groups"] = (0, 2)
+    look = {
+        # The arm from the side, with shadows, and what its own camera sees.
+        "side": CameraSensorCfg(
+            name="side", pos=(0.2, -0.85, 0.3), quat=(0.75, 0.66, 0.0, 0.0), fovy=50.0,
+            use_shadows=True, **common,
+        ),
+        "wrist": CameraSensorCfg(name="wrist", camera_name="robot/camera_d405", **common),
+    }  # fmt: skip
+    cfg = SceneCfg(
+        num_envs=1,
+        env_spacing=1.0,
+        terrain=task.terrain,
+        entities=task.entities,
+        sensors=tuple(look.values()),
+    )
+    scene = Scene(cfg, device="cpu")
+    sim = Simulation(1, SimulationCfg(engine=engine), spec=scene.spec, device="cpu")
+    scene.initialize(sim.mj_model, sim.model, sim.data)
+    sim.set_sensor_context(scene.sensor_context)
+    robot, cube = scene["robot"], scene["cube"]
+    robot.write_joint_state_to_sim(
+        robot.data.default_joint_pos, torch.zeros_like(robot.data.default_joint_pos)
+    )
+    cube.write_root_link_pose_to_sim(torch.tensor([[0.4, 0.0, 0.02, 0.95, 0.0, 0.0, 0.31]]))
+    sim.forward()
+    sim.sense()
+    pictures = {}
+    for name, white in (("side", 1.5), ("wrist", 0.5)):
+        data = scene[name].data
+        pictures[f"{name}: rgb"] = data.rgb[0].numpy()
+        pictures[f"{name}: depth"] = depth_colors(data.depth[0].numpy(), white)
+        pictures[f"{name}: segmentation"] = segmentation_colors(data.segmentation[0].numpy())
+    return pictures
+
+
+def draw_variants(path: Path) -> None:
+    """Draw the example of `variants.md` as it stands there, a while after it was dropped."""
+    page = (_DOCS / "how-to" / "variants.md").read_text(encoding="utf-8")
+    example: dict[str, Any] = {}
+    exec(page.split("```python\n")[1].split("```")[0], example)
+    plane = TerrainEntityCfg(terrain_type="plane")
+    entities = {"object": example["object_cfg"]}
+    scene = Scene(
+        SceneCfg(num_envs=12, env_spacing=0.3, terrain=plane, entities=entities), device="cpu"
+    )
+    sim = Simulation(
+        scene.num_envs,
+        SimulationCfg(engine="native"),
+        spec=scene.spec,
+        variant_info=scene.collect_variant_info(),
+        device="cpu",
+    )
+    scene.initialize(sim.mj_model, sim.model, sim.data)
+    sim.data.qpos[:, :3] = scene.env_origins + torch.tensor([0.0, 0.0, 0.1])
+    sim.step(500)
+    cfg = ViewerConfig(
+        width=720, height=300, max_extra_envs=11, origin_type=ViewerConfig.OriginType.WORLD,
+        distance=0.95, elevation=-35.0, azimuth=90.0, lookat=(0.0, 0.0, 0.05),
+    )  # fmt: skip
+    renderer = OffscreenRenderer(sim.mj_model, cfg, scene)
+    renderer.initialize()
+    renderer.update(sim)
+    Image.fromarray(renderer.render()).save(path, optimize=True)
+    renderer.close()
+    print(f"{path}: {path.stat().st_size // 1024} kB")
+
+
+def draw_terrains(path: Path) -> None:
+    """Draw every terrain preset, from easy at the left to difficult at the right."""
+    strips = {name: render_strip(preset()) for name, preset in ALL_TERRAIN_PRESETS.items()}
+    rows = -(-len(strips) // _STRIPS_PER_ROW)
+    width, height = _STRIPS_PER_ROW * _WIDTH, rows * (_HEIGHT + _TITLE)
+    figure = Figure(figsize=(width / 100, height / 100), dpi=100)
+    for index, (name, pixels) in enumerate(strips.items()):
+        row, col = divmod(index, _STRIPS_PER_ROW)
+        top = 1.0 - row / rows
+        left, share = col / _STRIPS_PER_ROW, _TITLE / height
+        axis = figure.add_axes(
+            (left, top - share - _HEIGHT / height, _WIDTH / width, _HEIGHT / height)
+        )
+        axis.imshow(pixels, aspect="auto")
+        axis.axis("off")
+        figure.text(
+            left + 0.5 / _STRIPS_PER_ROW, top - 1.2 * share, name,
+            ha="center", va="bottom", fontsize=13, family="monospace",
+        )  # fmt: skip
+    figure.text(
+        0.75, 0.5 / rows, "from left to right:\ndifficulty 0, 0.5 and 1,\n8 m x 8 m each",
+        ha="center", va="center", fontsize=13, color="0.3",
+    )  # fmt: skip
+    figure.savefig(path)
+    # A palette of 256 colours is a third of the size, and looks the same here.
+    image = Image.open(path).convert("RGB")
+    image.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
+    print(f"{path}: {path.stat().st_size // 1024} kB, {image.size[0]} x {image.size[1]}")
+
+
+def render_strip(sub: SubTerrainCfg) -> np.ndarray:
+    """Return (height, width, 3) of one kind of terrain at all difficulties."""
+    model = _strip_spec(sub).compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    camera = mujoco.MjvCamera()
+    camera.lookat = (0.0, 0.6, 0.0)
+    camera.distance, camera.azimuth, camera.elevation = 46.0, 90.0, -36.0
+    with open_renderer(model, _HEIGHT * _OVERSAMPLING, _WIDTH * _OVERSAMPLING) as renderer:
+        renderer.update_scene(data, camera)
+        pixels = renderer.render()
+    small = Image.fromarray(pixels).resize((_WIDTH, _HEIGHT), Image.Resampling.LANCZOS)
+    return np.asarray(small)
+
+
+def _strip_spec(sub: SubTerrainCfg) -> mujoco.MjSpec:
+    """Return a scene with one kind of terrain at all difficulties, lit from the left."""
+    spec = mujoco.MjSpec()
+    generator = TerrainGeneratorCfg(
+        seed=0,
+        curriculum=True,
+        size=(_SIZE, _SIZE),
+        num_rows=len(_DIFFICULTIES),
+        difficulty_range=(_DIFFICULTIES[0], _DIFFICULTIES[-1]),
+        border_width=0.4,
+        border_height=0.6,
+        sub_terrains={"shown": sub},
+    )
+    TerrainGenerator(generator).compile(spec)
+    spec.worldbody.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=(-10.0, -8.0, 20.0),
+        dir=(0.6, 0.3, -0.74),
+        diffuse=(0.8, 0.8, 0.78),
+        specular=(0.0, 0.0, 0.0),
+        castshadow=True,
+    )
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=(1.0, 1.0, 1.0),
+        width=16,
+        height=96,
+    )
+    visual = spec.visual
+    visual.headlight.ambient = (0.36, 0.36, 0.38)
+    visual.headlight.diffuse = (0.1, 0.1, 0.1)
+    visual.headlight.specular = (0.0, 0.0, 0.0)
+    visual.quality.shadowsize = 8192
+    # A narrow view from afar: all three look alike, wherever they are in the strip.
+    visual.global_.fovy = 9.1
+    visual.global_.offwidth = _WIDTH * _OVERSAMPLING
+    visual.global_.offheight = _HEIGHT * _OVERSAMPLING
+    return spec
+
+
+if __name__ == "__main__":
+    main()
