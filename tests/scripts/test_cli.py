@@ -201,3 +201,14 @@ def test_what_only_answers_loads_nothing_heavy(arguments):
         [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(("argv", "policy"), [(["-m"], "passive"), (["program"], None)])
+def test_idle_threads_of_torch_sleep_in_commands_that_are_run_as_modules(argv, policy):
+    # Set before the command's module, and torch with it, is imported. Programs decide themselves.
+    code = f"import sys; sys.argv = {argv}; import mjlab.scripts, os; "
+    code += "print(os.environ.get('OMP_WAIT_POLICY'))"
+    environment = {k: v for k, v in os.environ.items() if k != "OMP_WAIT_POLICY"}
+    command = [sys.executable, "-c", code]
+    told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == str(policy)

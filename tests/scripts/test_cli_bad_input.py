@@ -219,8 +219,9 @@ def test_a_model_file_that_is_missing_is_named(attempt, task_with):
 @pytest.mark.parametrize("count", ["0", "-3"])
 def test_a_number_of_environments_below_one_is_refused(attempt, count):
     message = attempt("--num-envs", count)
-    assert f"num_envs is {count}" in message
-    assert "at least 1" in message
+    assert "num_envs" in message
+    assert count in message
+    assert ">= 1" in message
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,8 @@ def test_training_and_playing_prepare_torch_first(monkeypatch, command):
     def prepare(device):
         raise Prepared(device)
 
-    monkeypatch.setattr("mjlab.utils.torch.prepare_torch", prepare)
+    module = "train" if command == "train" else "environments"
+    monkeypatch.setattr(f"mjlab.scripts.{module}.prepare_torch", prepare)
     task = "Mjlab-Cartpole-Balance"
     with pytest.raises(Prepared, match="cpu"):
         if command == "train":

@@ -17,7 +17,8 @@ from commands import SMALL, TASK
 from mjlab.rl.checkpoint import load_checkpoint
 from mjlab.rl.run_logger import IterationStats
 from mjlab.scripts import live
-from mjlab.scripts.live import Exchange, LiveJob, LiveView, NewestWeights
+from mjlab.scripts.live import LiveView
+from mjlab.scripts.live_view import Exchange, LiveJob, NewestWeights
 from mjlab.scripts.train import TrainConfig
 
 STATS = IterationStats(
@@ -175,11 +176,19 @@ def test_ports_that_do_not_exist_are_refused(run):
     assert "--live-port is 70000" in outcome.message
 
 
+def test_the_process_loads_nothing_heavy_before_a_browser_connects():
+    code = (
+        "import sys, mjlab.scripts.live_view; from mjlab.viewer.page_server import serve_page; "
+        "serve_page('127.0.0.1', 18341).stop(); assert not {'torch', 'mujoco'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_the_page_shows_the_policy_of_the_job(tmp_path, monkeypatch):
     import viser
 
     from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
-    from mjlab.scripts.live import _make_viewer
+    from mjlab.scripts.live_view import make_viewer
 
     cfg = TrainConfig.from_task(TASK)
     cfg.env.scene.num_envs = 2
@@ -188,7 +197,7 @@ def test_the_page_shows_the_policy_of_the_job(tmp_path, monkeypatch):
     monkeypatch.setattr(server, "get_clients", lambda: {0: SimpleNamespace()})
     try:
         job = LiveJob(TASK, live._env_to_show(cfg), cfg.agent, MjlabOnPolicyRunner)
-        viewer = _make_viewer(job, exchange, server)
+        viewer = make_viewer(job, exchange, server)
         assert isinstance(viewer.env, RslRlVecEnvWrapper)
         network = viewer._take_stats.__self__._network
         other = {key: torch.randn_like(value) for key, value in network.state_dict().items()

@@ -97,13 +97,13 @@ def test_settings_that_no_network_has_are_said_to_be_the_runs(run, trained, tmp_
     shutil.copytree(trained, folder)
     params = folder / "params" / "agent.yaml"
     saved = yaml.safe_load(params.read_text())
-    saved["actor"]["hidden_dims"] = [64, -1]
+    saved["actor"]["activation"] = "nonsense"
     params.write_text(yaml.safe_dump(saved))
     checkpoint = str(next(folder.glob("model_*.pt")))
     outcome = run("evaluate", TASK, "--device", "cpu", "--checkpoint-file", checkpoint)
     assert outcome.status == 1
     assert "agent.yaml" in outcome.message
-    assert "-1" in outcome.message
+    assert "nonsense" in outcome.message
 
 
 @pytest.mark.parametrize(
@@ -159,4 +159,5 @@ def test_fields_of_the_environment_are_flags_of_evaluate_and_play(run):
 def test_numbers_of_play_that_cannot_be_are_refused(run, flag, value):
     outcome = run("play", TASK, "--agent", "zero", flag, value)
     assert outcome.status == 1
-    assert f"{flag} is {value}" in outcome.message
+    assert flag in outcome.message
+    assert value in outcome.message

@@ -77,7 +77,7 @@ def test_terms_that_take_much_are_named(much):
 def test_numbers_that_are_too_small_are_refused(run, flag, least):
     outcome = run("profile_env", TASK, flag, str(least - 1))
     assert outcome.status == 1
-    assert f"{flag} is {least - 1}; it has to be at least {least}" in outcome.message
+    assert f"{flag}: expected an integer >= {least}, got {least - 1}" in outcome.message
 
 
 @pytest.mark.slow

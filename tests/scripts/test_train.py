@@ -167,7 +167,7 @@ def test_a_run_of_weights_and_biases_is_resumed(run, trained, tmp_path, monkeypa
         asked.append((experiment, str(run_path), name))
         return trained / "model_1.pt", True
 
-    monkeypatch.setattr("mjlab.utils.os.get_wandb_checkpoint_path", fetch)
+    monkeypatch.setattr("mjlab.scripts.resume.get_wandb_checkpoint_path", fetch)
     outcome = run(
         "train", TASK, "--num-envs", "16", "--device", "cpu", "--agent.max-iterations", "3",
         "--agent.num-steps-per-env", "8", "--log-root", str(tmp_path), "--agent.resume", "True",

@@ -104,7 +104,7 @@ def test_a_number_of_seeds_that_is_none_is_refused(run, commands, count):
     flags = ["--seeds"] if count is None else ["--seeds", count]
     outcome = run("train_seeds", TASK, *flags)
     assert outcome.status == 1
-    assert "--seeds is" in outcome.message
+    assert "--seeds: expected an integer" in outcome.message
     assert not commands
 
 

@@ -17,7 +17,6 @@ from mjlab.scripts.visualize_terrain import (
     with_values,
 )
 from mjlab.terrains.config import ALL_TERRAIN_PRESETS, flat, hf_pyramid_slope, wave_terrain
-from mjlab.utils.errors import UserError
 
 
 @pytest.mark.parametrize("name", ALL_TERRAIN_PRESETS)
@@ -96,13 +95,13 @@ def test_a_terrain_that_cannot_be_built_is_told_on_the_page_and_the_last_one_sta
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"terrain": "stair"}, "no terrain preset 'stair'. Choose from: all, flat, pyramid_stairs"),
-        ({"num_levels": 0}, "num_levels is 0"),
-        ({"size": 100.0}, "size 100.0"),
+        ({"terrain": "stair"}, "'stair'; did you mean .*'pyramid_stairs'"),
+        ({"num_levels": 0}, "num_levels: .* got 0"),
+        ({"size": 100.0}, "size: .* got 100.0"),
     ],
 )
 def test_flags_that_make_no_sense_are_refused(fields, message):
-    with pytest.raises(UserError, match=message):
+    with pytest.raises(ValueError, match=message):
         run_visualize_terrain(VisualizeTerrainConfig(**fields))
 
 

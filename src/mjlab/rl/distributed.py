@@ -28,9 +28,15 @@ from typing import IO, TypeVar
 
 import torch
 
-from mjlab.utils.errors import MjlabError, UserError
-from mjlab.utils.processes import PARENT_VARIABLE, ProcessRank, cores_per_process, process_rank
-from mjlab.utils.signals import handled_signals
+from mjlab.utils.errors import UserError
+from mjlab.utils.processes import (
+    PARENT_VARIABLE,
+    OtherProcessError,
+    ProcessRank,
+    cores_per_process,
+    process_rank,
+)
+from mjlab.utils.signals import FORWARDED, handled_signals
 
 T = TypeVar("T")
 
@@ -44,22 +50,9 @@ logger = logging.getLogger(__name__)
 # Seconds after which a process says for whom it waits, and after which it gives up, as torch does.
 _SECONDS_OF_SILENCE = 5.0
 _SECONDS_TO_JOIN = 1800.0
-# Signals that end the launcher, and those that the processes get instead: they save at the first two.
-_FORWARDED: dict[int, signal.Signals] = {
-    signal.SIGINT: signal.SIGINT,
-    signal.SIGTERM: signal.SIGTERM,
-    signal.SIGHUP: signal.SIGTERM,
-}
 _SECONDS_BETWEEN_LOOKS = 0.05
 # Seconds that processes may take to notice that one of them is gone, and to say so.
 _PATIENCE = 5.0
-
-
-class OtherProcessError(MjlabError, RuntimeError):
-    """Another process of the run failed, and said why; this one cannot go on without it."""
-
-    exit_status = 3
-    """Exit status of a command that ends with this error."""
 
 
 # Launching.
@@ -94,11 +87,11 @@ def launch_workers(
     killed = set()
 
     def forward(number: int, frame: FrameType | None) -> None:
-        received.append(_FORWARDED[number])
+        received.append(FORWARDED[number])
         for worker in workers:
-            worker.send_signal(_FORWARDED[number])
+            worker.send_signal(FORWARDED[number])
 
-    with handled_signals(forward, _FORWARDED):
+    with handled_signals(forward, FORWARDED):
         for rank in range(count):
             own = {**shared, "RANK": str(rank), "LOCAL_RANK": str(rank)}
             # A session of its own: a terminal sends Ctrl-C to all processes of its session, and a

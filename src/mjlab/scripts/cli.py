@@ -16,13 +16,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NoReturn
 
+from mjlab.scripts import prepare_threads
 from mjlab.utils.errors import BadCallError, MjlabError, UserError
 from mjlab.utils.logging import shorten
+from mjlab.utils.processes import OtherProcessError
 
 TRACEBACK_VARIABLE = "MJLAB_TRACEBACK"
-
-# Exit status of a process that gave up because another of its run failed.
-OTHER_PROCESS_STATUS = 3
 
 # Messages of Python, the dynamic loader, MuJoCo and torch (CPU, GPU) about too little memory.
 _OUT_OF_MEMORY = (
@@ -388,8 +387,7 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
     An error that a user can fix (`MjlabError`, `ValueError`, `OSError`) is printed as one message,
     and the exit status is that of the error, or 1. Other errors keep their traceback.
     """
-    # torch's idle threads would otherwise spin, and take the cores from the physics threads.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    prepare_threads()
     # Plain messages of the libraries, and warnings as one line each.
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
     logging.getLogger("mjlab").setLevel(logging.INFO)
@@ -405,7 +403,7 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except Exception as error:
-        if _is_out_of_memory(error):
+        if isinstance(error, MemoryError) or any(text in str(error) for text in _OUT_OF_MEMORY):
             # The original message says where the memory ended, not that it did.
             error = UserError(
                 f"Memory or threads are not enough ({_text(error)}). Use fewer environments, or raise "
@@ -415,20 +413,14 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
             raise
         if os.environ.get(TRACEBACK_VARIABLE):
             traceback.print_exc()
-        status = error.exit_status if isinstance(error, MjlabError) else 1
         rank = os.environ.get("RANK", "0")
         # Of several processes, only the one that failed and the first report.
-        if rank == "0" or status != OTHER_PROCESS_STATUS:
+        if rank == "0" or not isinstance(error, OtherProcessError):
             process = "" if rank == "0" else f" in process {rank}"
             print(f"error{process}: {_text(error)}", file=sys.stderr)
             print(f"(Set {TRACEBACK_VARIABLE}=1 for where it came from.)", file=sys.stderr)
-        sys.exit(status)
+        sys.exit(error.exit_status if isinstance(error, MjlabError) else 1)
     sys.exit(0)
-
-
-def _is_out_of_memory(error: Exception) -> bool:
-    message = str(error)
-    return isinstance(error, MemoryError) or any(text in message for text in _OUT_OF_MEMORY)
 
 
 def _text(error: BaseException) -> str:

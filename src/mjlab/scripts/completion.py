@@ -43,19 +43,13 @@ def candidates(words: list[str]) -> list[str]:
     *before, partial = words or [""]
     if not before:
         names = [command.name for command in COMMANDS]
-    elif len(before) == 1 and _takes_task(before[0]):
+    elif before in ([c.name] for c in COMMANDS if c.argument in ("TASK", "TARGET")):
         from mjlab.tasks.registry import list_tasks
 
         names = list_tasks()
     else:
         return []
     return [name for name in names if name.startswith(partial)]
-
-
-def _takes_task(name: str) -> bool:
-    from mjlab.scripts.cli import COMMANDS
-
-    return any(c.name == name and c.argument in ("TASK", "TARGET") for c in COMMANDS)
 
 
 def command(argv: list[str], prog: str) -> None:
@@ -83,3 +77,7 @@ def main() -> None:
     from mjlab.scripts.cli import run_alias
 
     run_alias("completion")
+
+
+if __name__ == "__main__":
+    main()

@@ -23,21 +23,21 @@ from mjlab.tasks.tracking.motion_recording import (
     recording_of,
     resampled,
 )
-from mjlab.utils.errors import UserError
+from mjlab.utils.errors import UserError, check_positive
 from mjlab.utils.logging import print_notice
 from mjlab.viewer.page_server import check_address, page_url, serve_page
 
 if TYPE_CHECKING:
-    import mujoco
     import viser
 
     from mjlab.entity import Entity
-    from mjlab.tasks.tracking.motion_file import Motion
+
 _WANDB_PROJECT = "csv_to_npz"
 _ARTIFACT_TYPE = "motions"
 # As mjlab 1.6 calls it, so that its `play` finds it.
 _ARTIFACT_FILE = "motion.npz"
 _VIDEO_SIZE = (480, 640)
+
 __getattr__ = older_names(__name__)
 
 
@@ -89,9 +89,7 @@ def convert(cfg: CsvToNpzConfig) -> Path:
     if not cfg.input_file:
         raise UserError("--input-file names the recording, a .csv or an .npz.")
     for name in ("input_fps", "output_fps"):
-        if not getattr(cfg, name) > 0.0:
-            flag = name.replace("_", "-")
-            raise UserError(f"--{flag} is {getattr(cfg, name)}; it has to be above 0.")
+        check_positive(f"--{name.replace('_', '-')}", getattr(cfg, name))
     if cfg.view:
         check_address(cfg.host, cfg.port, "--")
     robot = _robot(cfg.robot)
@@ -163,8 +161,6 @@ def _robot(name: str) -> Entity:
 
 def _stage(robot: Entity) -> mujoco.MjModel:
     """Return the robot on a floor, to look at."""
-    import mujoco
-
     spec = robot.cfg.build().spec
     floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE)
     floor.size, floor.rgba = (10.0, 10.0, 0.1), (0.75, 0.78, 0.82, 1.0)
@@ -174,8 +170,6 @@ def _stage(robot: Entity) -> mujoco.MjModel:
 
 def record_motion(motion: Motion, robot: Entity, path: Path) -> None:
     """Write a video of the motion."""
-    import mujoco
-
     from mjlab.utils.wrappers.video_recorder import ClipWriter
     from mjlab.viewer.offscreen_renderer import open_renderer
 
@@ -198,8 +192,6 @@ def record_motion(motion: Motion, robot: Entity, path: Path) -> None:
 
 def pose(model: mujoco.MjModel, data: mujoco.MjData, motion: Motion, frame: int) -> None:
     """Put a robot, whose free joint comes first, onto a frame of its motion."""
-    import mujoco
-
     data.qpos[:3], data.qpos[3:7] = motion.body_pos_w[frame, 0], motion.body_quat_w[frame, 0]
     data.qpos[7:] = motion.joint_pos[frame]
     mujoco.mj_kinematics(model, data)
@@ -212,25 +204,21 @@ def _upload(path: Path, name: str) -> None:
     Raises:
         UserError: Weights & Biases does not take it.
     """
+    import wandb
+
     try:
-        _send(path, name)
+        run = wandb.init(project=_WANDB_PROJECT, name=name)
+        try:
+            artifact = wandb.Artifact(name=name, type=_ARTIFACT_TYPE)
+            artifact.add_file(str(path), name=_ARTIFACT_FILE)
+            logged = run.log_artifact(artifact)
+            run.link_artifact(logged, target_path=f"wandb-registry-{_ARTIFACT_TYPE}/{name}")
+        finally:
+            run.finish()
     except Exception as error:
         # wandb raises errors of many kinds, of its own and of what it is built on.
         raise UserError(f"{path} cannot be uploaded to Weights & Biases: {error}") from error
     print_notice(f"Uploaded as wandb-registry-{_ARTIFACT_TYPE}/{name}.")
-
-
-def _send(path: Path, name: str) -> None:
-    import wandb
-
-    run = wandb.init(project=_WANDB_PROJECT, name=name)
-    try:
-        artifact = wandb.Artifact(name=name, type=_ARTIFACT_TYPE)
-        artifact.add_file(str(path), name=_ARTIFACT_FILE)
-        logged = run.log_artifact(artifact)
-        run.link_artifact(logged, target_path=f"wandb-registry-{_ARTIFACT_TYPE}/{name}")
-    finally:
-        run.finish()
 
 
 # The page.

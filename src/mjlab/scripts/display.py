@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -18,16 +18,32 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
+from mjlab.scripts.flags import prepare_env_cfg
+from mjlab.scripts.policy import policy_env_cfg
+from mjlab.scripts.record import VideoCfg, record_policy
 from mjlab.sim.warning_log import mujoco_warnings
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.rl.evaluation import EvaluationResult
-    from mjlab.scripts.run_folder import NewRunFolder, SharedRunFolder
+    from mjlab.scripts.run_folder import NewRunFolder
     from mjlab.scripts.train_config import TrainConfig
 
 # Plain lines are for log files: often enough to follow, rarely enough to read.
 _SECONDS_BETWEEN_LINES = 5.0
+
+
+def show_training(task: str, cfg: TrainConfig, runner: Any, folder: NewRunFolder) -> None:
+    """Let `runner` show its training in the terminal, with `--live` in the browser too.
+
+    The folder is kept once training has started.
+    """
+    if cfg.live:
+        from mjlab.scripts.live import LiveView
+
+        # First, because the display keeps the terminal to itself once it has started.
+        runner.observers.insert(0, LiveView(task, cfg, runner))
+    runner.observers += [KeepRunFolder(folder), TrainingDisplay(task)]
 
 
 class _LastingConsole(Console):
@@ -76,7 +92,16 @@ class TrainingDisplay(TrainingObserver):
         last = stats.iteration == stats.total_iterations
         if last or now - self._last_line >= _SECONDS_BETWEEN_LINES:
             self._last_line = now
-            self._console.print(_line(stats), highlight=False, soft_wrap=True)
+            line = (
+                f"[{stats.iteration}/{stats.total_iterations}] "
+                f"{stats.steps_per_second:,.0f} steps/s "
+                f"(collection {stats.collection_time:.2f} s, learning {stats.learning_time:.2f} s), "
+                f"mean reward {_figure(stats.mean_reward)}, "
+                f"episode length {_figure(stats.mean_episode_length)}, "
+                f"step reward {stats.mean_step_reward:.3f}, {left} left"
+            )
+            # A bracket begins markup.
+            self._console.print(line.replace("[", r"\[", 1), highlight=False, soft_wrap=True)
 
     def on_evaluation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
         """Tell how an evaluation went."""
@@ -123,12 +148,21 @@ class TrainingDisplay(TrainingObserver):
         sys.stdout.flush()
 
     def _panel(self, stats: IterationStats) -> Panel:
+        cells = [
+            ("steps per second", f"{stats.steps_per_second:,.0f}"),
+            ("steps in total", f"{stats.total_steps:,}"),
+            ("collection", f"{stats.collection_time:.3f} s"),
+            ("learning", f"{stats.learning_time:.3f} s"),
+            ("mean reward", _figure(stats.mean_reward)),
+            ("mean episode length", _figure(stats.mean_episode_length)),
+            ("mean step reward", f"{stats.mean_step_reward:.3f}"),
+            ("action noise", f"{stats.action_std:.3f}"),
+        ]
         table = Table.grid(padding=(0, 3))
         for _ in range(4):
             table.add_column()
-        cells = _cells(stats)
         for first, second in zip(cells[::2], cells[1::2], strict=True):
-            table.add_row(first[0], first[1], second[0], second[1])
+            table.add_row(*first, *second)
         return Panel(Group(self._progress, table), title=self._title, title_align="left")
 
 
@@ -141,31 +175,6 @@ def _let_go_of(is_gone: Callable[[os.stat_result], bool]) -> None:
     with open(os.devnull, "wb") as nowhere, contextlib.suppress(OSError):
         for number in [number for number in (1, 2) if is_gone(os.fstat(number))]:
             os.dup2(nowhere.fileno(), number)
-
-
-def _cells(stats: IterationStats) -> list[tuple[str, str]]:
-    return [
-        ("steps per second", f"{stats.steps_per_second:,.0f}"),
-        ("steps in total", f"{stats.total_steps:,}"),
-        ("collection", f"{stats.collection_time:.3f} s"),
-        ("learning", f"{stats.learning_time:.3f} s"),
-        ("mean reward", _figure(stats.mean_reward)),
-        ("mean episode length", _figure(stats.mean_episode_length)),
-        ("mean step reward", f"{stats.mean_step_reward:.3f}"),
-        ("action noise", f"{stats.action_std:.3f}"),
-    ]
-
-
-def _line(stats: IterationStats) -> str:
-    return (
-        f"[{stats.iteration}/{stats.total_iterations}] "
-        f"{stats.steps_per_second:,.0f} steps/s "
-        f"(collection {stats.collection_time:.2f} s, learning {stats.learning_time:.2f} s), "
-        f"mean reward {_figure(stats.mean_reward)}, "
-        f"episode length {_figure(stats.mean_episode_length)}, "
-        f"step reward {stats.mean_step_reward:.3f}, "
-        f"{duration(stats.time_left)} left"
-    ).replace("[", r"\[", 1)
 
 
 def _figure(value: float | None) -> str:
@@ -186,7 +195,7 @@ def duration(seconds: float) -> str:
 class KeepRunFolder(TrainingObserver):
     """Keeps the run's folder once training has started."""
 
-    def __init__(self, folder: NewRunFolder | SharedRunFolder) -> None:
+    def __init__(self, folder: NewRunFolder) -> None:
         self._folder = folder
 
     def on_start(self, first_iteration: int, total_iterations: int) -> None:
@@ -217,21 +226,13 @@ def leave_results(task: str, cfg: TrainConfig, run_dir: Path, device: str) -> No
         plot_run(run_dir, run_dir / "learning_curve.png", title=task)
     checkpoint = latest_checkpoint(run_dir)
     if cfg.result_video and checkpoint is not None:
-        from mjlab.scripts.flags import prepare_env_cfg
-        from mjlab.scripts.policy import VideoCfg, policy_env_cfg, record_policy
         from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
 
         env_cfg = policy_env_cfg(task, cfg.profile, purpose="play")
         prepare_env_cfg(task, None, env_cfg, checkpoint)
         try:
-            record_policy(
-                task,
-                env_cfg,
-                checkpoint,
-                run_dir / "videos",
-                device,
-                VideoCfg(profile=cfg.profile),
-            )
+            video = VideoCfg(profile=cfg.profile)
+            record_policy(task, env_cfg, checkpoint, run_dir / "videos", device, video)
         except RenderingUnavailableError as error:
             print(f"No video: {error}")
     print("Results:")

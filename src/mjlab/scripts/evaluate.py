@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.devices import resolve_device
 from mjlab.scripts.environments import make_env
@@ -21,7 +20,7 @@ from mjlab.scripts.policy import (
     policy_env_cfg,
 )
 from mjlab.tasks.registry import load_rl_cfg
-from mjlab.utils.errors import UserError
+from mjlab.utils.errors import check_count
 
 
 @dataclass
@@ -56,21 +55,15 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     """
     from mjlab.rl.evaluation import evaluate_policy, required_return, success_definition
 
-    if cfg.num_episodes < 1:
-        raise UserError(f"--num-episodes is {cfg.num_episodes}; at least 1 has to be played.")
+    check_count("--num-episodes", cfg.num_episodes)
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
     env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="evaluate")
+    usual = policy_env_cfg(task, cfg.profile, purpose="evaluate").scene.num_envs
+    is_chosen = keep_num_envs or env_cfg.scene.num_envs != usual
+    num_envs = None if is_chosen else cfg.num_episodes
     solved = load_rl_cfg(task, profile=cfg.profile).evaluation
-    env = make_env(
-        task,
-        env_cfg,
-        device,
-        _num_envs(task, cfg, env_cfg, keep_num_envs),
-        cfg.engine,
-        seed=cfg.seed,
-        profile=cfg.profile,
-    )
+    env = make_env(task, env_cfg, device, num_envs, cfg.engine, seed=cfg.seed, profile=cfg.profile)
     try:
         policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
         result = evaluate_policy(
@@ -99,15 +92,6 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     }
     print(json.dumps(figures, indent=2) if cfg.json else _table(figures))
     return figures
-
-
-def _num_envs(
-    task: str, cfg: EvaluateConfig, env_cfg: ManagerBasedRlEnvCfg, keep_num_envs: bool
-) -> int:
-    """Return the number of environments: the one set by --env.scene.num-envs, else one per episode."""
-    usual = policy_env_cfg(task, cfg.profile, purpose="evaluate").scene.num_envs
-    chosen = env_cfg.scene.num_envs
-    return chosen if keep_num_envs or chosen != usual else cfg.num_episodes
 
 
 def _table(figures: dict[str, Any]) -> str:

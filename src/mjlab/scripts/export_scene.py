@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from mjlab.entity import EntityCfg
     from mjlab.scene import Scene, SceneCfg
     from mjlab.sim import MujocoCfg
+
 ROBOTS = {"g1": "get_g1_robot_cfg", "go1": "get_go1_robot_cfg", "yam": "get_yam_robot_cfg"}
 """Short names of robots, and the functions of `mjlab.asset_zoo.robots` that configure them."""
 
@@ -55,11 +56,14 @@ def run_export_scene(target: str, cfg: ExportSceneConfig) -> Path:
     Raises:
         UserError: an unknown target, or a place that is taken.
     """
+    from mjlab.scene import Scene
+
     scene_cfg, options = _load(target)
-    folder = _folder(cfg)
-    result = folder.with_name(folder.name + ".zip") if cfg.zip else folder
-    _check_place(result, cfg)
-    scene = _build(scene_cfg, options)
+    folder, result = _destination(cfg)
+    scene = Scene(scene_cfg, "cpu")
+    target_options: Any = SimpleNamespace(opt=scene.spec.option)
+    scene.report_overruled_options(options)
+    options.apply(target_options)
     if cfg.zip:
         scene.write(folder, zip=True)
     else:
@@ -127,42 +131,28 @@ def _from_function(target: str) -> EntityCfg:
     return made
 
 
-def _build(scene_cfg: SceneCfg, options: MujocoCfg) -> Scene:
-    from mjlab.scene import Scene
-
-    scene = Scene(scene_cfg, "cpu")
-    target: Any = SimpleNamespace(opt=scene.spec.option)
-    scene.report_overruled_options(options)
-    options.apply(target)
-    return scene
-
-
-def _folder(cfg: ExportSceneConfig) -> Path:
+def _destination(cfg: ExportSceneConfig) -> tuple[Path, Path]:
+    """Return the folder to write, and the folder or archive that it ends as, which must be free."""
     folder = Path(cfg.output_dir)
-    if not cfg.zip:
-        return folder
-    if folder.suffix == ".zip":
-        return folder.with_suffix("")
-    # An archive needs a name, which these paths do not say: `.`, `..`, `/`.
-    if folder.name in ("", ".."):
-        folder = folder.resolve()
-    if not folder.name:
-        raise UserError(f"--output-dir {cfg.output_dir} has no name that an archive could have.")
-    return folder
-
-
-def _check_place(result: Path, cfg: ExportSceneConfig) -> None:
+    if cfg.zip:
+        folder = folder.with_suffix("") if folder.suffix == ".zip" else folder
+        # An archive needs a name, which these paths do not say: `.`, `..`, `/`.
+        folder = folder.resolve() if folder.name in ("", "..") else folder
+        if not folder.name:
+            raise UserError(
+                f"--output-dir {cfg.output_dir} has no name that an archive could have."
+            )
+    result = folder.with_name(f"{folder.name}.zip") if cfg.zip else folder
     if not cfg.zip and result.exists() and not result.is_dir():
         raise UserError(f"{result} is a file. Choose another --output-dir.")
-    if cfg.overwrite or not result.exists():
-        return
-    if result.is_dir() and not any(result.iterdir()):
-        return
-    what = f"The archive {result} exists" if cfg.zip else f"The folder {result} is not empty"
-    raise UserError(
-        f"{what}. Choose another --output-dir, or give --overwrite True to replace an earlier "
-        "export there."
-    )
+    is_free = not result.exists() or (result.is_dir() and not any(result.iterdir()))
+    if not is_free and not cfg.overwrite:
+        taken = f"The archive {result} exists" if cfg.zip else f"The folder {result} is not empty"
+        raise UserError(
+            f"{taken}. Choose another --output-dir, or give --overwrite True to replace an earlier "
+            "export there."
+        )
+    return folder, result
 
 
 def _write_folder(scene: Scene, folder: Path) -> None:

@@ -328,10 +328,11 @@ def _term_at(config: Any, flag: str) -> tuple[Any, str]:
         if holder is None:
             return None, ""
         names = list(holder) if isinstance(holder, Mapping) else list(vars(holder))
-        matching = [name for name in names if _spelled_alike(name, part)]
-        if not matching:
+        # tyro writes `smooth_reward` as `smooth-reward` and takes both.
+        spelled = {str(name).replace("_", "-"): name for name in reversed(names)}
+        key = spelled.get(part.replace("_", "-"))
+        if not isinstance(key, str):
             return None, ""
-        key = matching[0]
         value = holder[key] if isinstance(holder, Mapping) else getattr(holder, key)
         if not is_dataclass(value) and not isinstance(value, Mapping | None):
             return None, ""
@@ -351,11 +352,6 @@ def _may_be_none(holder: Any, key: str) -> bool:
     return NoneType in options and any(
         is_dataclass(option) or get_origin(option) is dict for option in options
     )
-
-
-def _spelled_alike(name: Any, part: str) -> bool:
-    # tyro writes `smooth_reward` as `smooth-reward` and takes both.
-    return isinstance(name, str) and name.replace("_", "-") == part.replace("_", "-")
 
 
 # Values that tyro alone does not read: lists for tuples, and tensors.

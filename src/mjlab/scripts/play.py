@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
+import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from mjlab.compat import older_names
 from mjlab.scripts.cli import run_alias
@@ -20,12 +21,13 @@ from mjlab.scripts.policy import (
     make_policy,
     parse_policy_flags,
 )
+from mjlab.scripts.record import VideoCfg, record_policy
 from mjlab.scripts.run_folder import is_run_folder
-from mjlab.utils.errors import UserError
+from mjlab.utils.errors import UserError, check_count
+from mjlab.utils.torch import threads_for_policy
+from mjlab.viewer.base import run_headless
 from mjlab.viewer.page_server import check_address
 
-if TYPE_CHECKING:
-    from mjlab.envs import ManagerBasedRlEnvCfg
 __getattr__ = older_names(__name__)
 
 
@@ -75,12 +77,11 @@ def run_play(task: str, cfg: PlayConfig) -> None:
         UserError, ValueError, OSError, CheckpointError, EngineUnavailableError,
         RenderingUnavailableError: what was asked for cannot be done.
     """
-    if cfg.num_steps is not None and cfg.num_steps < 1:
-        raise UserError(f"--num-steps is {cfg.num_steps}; it has to be at least 1.")
+    if cfg.num_steps is not None:
+        check_count("--num-steps", cfg.num_steps)
     if cfg.viewer == "none" and cfg.num_steps is None and not cfg.video:
         raise UserError("--viewer none needs --num-steps, because nothing else would end it.")
-    if cfg.video_length < 1:
-        raise UserError(f"--video-length is {cfg.video_length}; it has to be at least 1.")
+    check_count("--video-length", cfg.video_length)
     check_address(cfg.host, cfg.port, "--")
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
@@ -88,32 +89,39 @@ def run_play(task: str, cfg: PlayConfig) -> None:
     if cfg.no_terminations:
         env_cfg.terminations = {}
     if cfg.video:
-        _record(task, cfg, env_cfg, checkpoint, device)
+        folder = Path("videos")
+        if checkpoint is not None and is_run_folder(checkpoint.parent):
+            folder = checkpoint.parent / "videos" / "play"
+        video = VideoCfg(
+            length=cfg.num_steps or cfg.video_length,
+            suffix=cfg.video_format,
+            height=cfg.video_height,
+            width=cfg.video_width,
+            camera=cfg.camera,
+            num_envs=cfg.num_envs,
+            engine=cfg.engine,
+            agent=cfg.agent,
+            profile=cfg.profile,
+        )
+        record_policy(task, env_cfg, checkpoint, folder, device, video)
         return
-    from mjlab.utils.torch import threads_for_policy
-
     env = make_env(task, env_cfg, device, cfg.num_envs, cfg.engine, profile=cfg.profile)
     print(f"Physics:    {env.unwrapped.sim.capabilities.description}")
     try:
         policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
         with threads_for_policy(policy, env.num_envs, device):
             if cfg.viewer == "none" and cfg.num_steps is not None:
-                _play_headless(env, policy, cfg.num_steps)
+                result = run_headless(env, policy, cfg.num_steps)
+                print(
+                    f"{result.num_steps} steps in {env.num_envs} environments, "
+                    f"{result.num_episodes} episodes ended, mean reward per step "
+                    f"{result.mean_step_reward:.4f}"
+                )
             else:
                 viewer = _make_viewer(task, cfg, env, policy, checkpoint, device)
                 viewer.run(num_steps=cfg.num_steps)
     finally:
         env.close()
-
-
-def _play_headless(env: Any, policy: Any, num_steps: int) -> None:
-    from mjlab.viewer.base import run_headless
-
-    result = run_headless(env, policy, num_steps)
-    print(
-        f"{result.num_steps} steps in {env.num_envs} environments, {result.num_episodes} episodes "
-        f"ended, mean reward per step {result.mean_step_reward:.4f}"
-    )
 
 
 def _make_viewer(
@@ -136,8 +144,6 @@ def _make_viewer(
     viewer = ViserPlayViewer(env, policy, checkpoint_manager=manager, host=cfg.host, port=cfg.port)
     print(f"Open {viewer.url} in a browser. Ctrl-C ends.", flush=True)
     if cfg.open_browser and _can_open_browser():
-        import webbrowser
-
         webbrowser.open(viewer.url)
     return viewer
 
@@ -149,38 +155,6 @@ def _has_display() -> bool:
 def _can_open_browser() -> bool:
     # Without a display, Linux would open a browser for the terminal, in this terminal.
     return sys.platform in ("darwin", "win32") or _has_display()
-
-
-def _record(
-    task: str,
-    cfg: PlayConfig,
-    env_cfg: ManagerBasedRlEnvCfg,
-    checkpoint: Path | None,
-    device: str,
-) -> None:
-    from mjlab.scripts.policy import VideoCfg, record_policy
-
-    folder = Path("videos")
-    if checkpoint is not None and is_run_folder(checkpoint.parent):
-        folder = checkpoint.parent / "videos" / "play"
-    record_policy(
-        task,
-        env_cfg,
-        checkpoint,
-        folder,
-        device,
-        VideoCfg(
-            length=cfg.num_steps or cfg.video_length,
-            suffix=cfg.video_format,
-            height=cfg.video_height,
-            width=cfg.video_width,
-            camera=cfg.camera,
-            num_envs=cfg.num_envs,
-            engine=cfg.engine,
-            agent=cfg.agent,
-            profile=cfg.profile,
-        ),
-    )
 
 
 def main() -> None:

@@ -10,10 +10,13 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
+import torch
+from torch import nn
+
 from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.rl.checkpoint import CheckpointError, learner_of_checkpoint
 from mjlab.rl.config import RslRlBaseRunnerCfg, RslRlDistillationRunnerCfg, RslRlModelCfg
 from mjlab.rl.learners import Learner, acting_cfg
-from mjlab.scripts.environments import make_env
 from mjlab.scripts.flags import (
     is_given,
     parse_with_choices,
@@ -30,7 +33,7 @@ from mjlab.scripts.run_folder import (
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.logging import print_notice
-from mjlab.viewer.base import ended, forget
+from mjlab.utils.os import get_wandb_checkpoint_path
 
 
 @dataclass
@@ -60,8 +63,6 @@ class PolicyFlags:
 
 
 F = TypeVar("F", bound=PolicyFlags)
-
-
 Purpose = Literal["play", "evaluate", "train"]
 
 
@@ -117,14 +118,18 @@ def find_checkpoint(task: str, flags: PolicyFlags) -> Path | None:
     if flags.checkpoint_file is not None:
         path = resolve_checkpoint(Path(flags.checkpoint_file), task)
     elif flags.wandb_run_path is not None:
-        from mjlab.utils.os import get_wandb_checkpoint_path
-
         run = Path(flags.wandb_run_path)
         name = flags.wandb_checkpoint_name
         path = get_wandb_checkpoint_path(_experiment(task, flags), run, name)[0]
     else:
         path = _newest_checkpoint(task, flags)
-    _check_learner(flags, path)
+    if flags.learner is not None and path.suffix != ".onnx":
+        found = learner_of_checkpoint(path)
+        if found != flags.learner:
+            raise UserError(
+                f"--learner: expected {found!r}, which wrote {path}, got {flags.learner!r}; leave it "
+                "out, or name another checkpoint."
+            )
     return path
 
 
@@ -141,20 +146,6 @@ def _newest_checkpoint(task: str, flags: PolicyFlags) -> Path:
         )
     print_notice(f"Checkpoint: {path}")
     return path
-
-
-def _check_learner(flags: PolicyFlags, checkpoint: Path) -> None:
-    """Raise UserError if the flags name another learner than the one that wrote `checkpoint`."""
-    if flags.learner is None or checkpoint.suffix == ".onnx":
-        return
-    from mjlab.rl.checkpoint import learner_of_checkpoint
-
-    found = learner_of_checkpoint(checkpoint)
-    if found != flags.learner:
-        raise UserError(
-            f"--learner: expected {found!r}, which wrote {checkpoint}, got {flags.learner!r}; leave "
-            "it out, or name another checkpoint."
-        )
 
 
 def _experiment(task: str, flags: PolicyFlags) -> Path:
@@ -268,7 +259,6 @@ def load_policy(
 
         return load_onnx_policy(checkpoint, env, device)
     from mjlab.rl import MjlabOnPolicyRunner
-    from mjlab.rl.checkpoint import CheckpointError, learner_of_checkpoint
 
     learner = learner_of_checkpoint(checkpoint)
     agent_cfg = _agent_cfg(task, checkpoint, profile, learner)
@@ -286,8 +276,6 @@ def load_policy(
 
 def constant_policy(env: Any, kind: str) -> Any:
     """Return a policy that does not look: `zero` actions, or `random` ones in [-1, 1]."""
-    import torch
-
     shape = (env.num_envs, env.num_actions)
     if kind == "zero":
         zeros = torch.zeros(shape, dtype=torch.float32, device=env.device)
@@ -361,8 +349,6 @@ def _is_own(class_name: str, model: RslRlModelCfg) -> bool:
         found = getattr(importlib.import_module(module), name, None)
     except ImportError:
         return False
-    from torch import nn
-
     return isinstance(found, type) and issubclass(found, nn.Module)
 
 
@@ -389,97 +375,15 @@ def prepare_teacher(task: str, cfg: RslRlBaseRunnerCfg, resumed: Path | None) ->
         cfg.teacher_checkpoint = recorded if isinstance(recorded, str) else None
     elif given is not None:
         path = resolve_checkpoint(Path(given), task)
-        _check_teacher(task, path, flag)
+        if (learner := learner_of_checkpoint(path)) != "ppo":
+            raise UserError(
+                f"{flag}: expected a checkpoint of the learner 'ppo', got {path}, which {learner!r} "
+                "wrote."
+            )
+        if (trained := read_run_info(path.parent).get("task", task)) != task:
+            raise UserError(f"{flag}: expected a checkpoint of {task}, got {path}, of {trained}.")
         cfg.teacher_checkpoint = str(path)
         saved, network = read_agent_params(path.parent), "actor"
     else:
         return
     cfg.teacher = replace(cfg.teacher, **_saved_settings(saved, network, cfg.teacher))
-
-
-def _check_teacher(task: str, path: Path, flag: str) -> None:
-    from mjlab.rl.checkpoint import learner_of_checkpoint
-
-    learner = learner_of_checkpoint(path)
-    if learner != "ppo":
-        raise UserError(
-            f"{flag}: expected a checkpoint of the learner 'ppo', got {path}, which {learner!r} wrote."
-        )
-    trained = read_run_info(path.parent).get("task", task)
-    if trained != task:
-        raise UserError(f"{flag}: expected a checkpoint of {task}, got {path}, of {trained}.")
-
-
-# Recording it.
-
-
-@dataclass(frozen=True)
-class VideoCfg:
-    """What a recording looks like."""
-
-    length: int = 200
-    """Frames, one an environment step."""
-    height: int | None = None
-    """Height in pixels; None keeps the task's."""
-    width: int | None = None
-    """Width in pixels; None keeps the task's."""
-    suffix: Literal["mp4", "gif"] = "mp4"
-    """Format of the file."""
-    camera: int | str | None = None
-    """Camera of the model, by name or index; None is the task's own view."""
-    num_envs: int | None = None
-    """Number of environments; None keeps the task's."""
-    engine: Any = None
-    """Physics engine; None keeps the task's."""
-    agent: str = "trained"
-    """Who acts where there is no checkpoint: `zero` or `random`."""
-    profile: str | None = None
-    """Profile of the task that the policy was trained with."""
-
-
-def record_policy(
-    task: str,
-    env_cfg: ManagerBasedRlEnvCfg,
-    checkpoint: Path | None,
-    folder: Path,
-    device: str,
-    video: VideoCfg | None = None,
-) -> Path | None:
-    """Record one clip into `folder` and return its path.
-
-    Raises:
-        RenderingUnavailableError: this machine cannot render; the message says what to install.
-    """
-    import torch
-
-    from mjlab.utils.wrappers.video_recorder import ClipWriter
-
-    video = video or VideoCfg()
-
-    env_cfg = copy.deepcopy(env_cfg)
-    env_cfg.viewer.height = video.height or env_cfg.viewer.height
-    env_cfg.viewer.width = video.width or env_cfg.viewer.width
-    env = make_env(
-        task,
-        env_cfg,
-        device,
-        video.num_envs,
-        video.engine,
-        render_mode="rgb_array",
-        profile=video.profile,
-    )
-    try:
-        policy = make_policy(task, env, video.agent, checkpoint, device, video.profile)
-        name = video.agent if checkpoint is None else checkpoint.stem
-        writer = ClipWriter(
-            folder / f"{task}-{name}.{video.suffix}", env.unwrapped.metadata["render_fps"]
-        )
-        with torch.inference_mode():
-            for _ in range(video.length):
-                forget(policy, ended(env.step(policy(env.get_observations()))))
-                writer.add(env.unwrapped.render(video.camera))
-        path = writer.close()
-    finally:
-        env.close()
-    print(f"Video: {path}")
-    return path

@@ -22,10 +22,12 @@ from mjlab.scripts.policy import (
     make_policy,
     parse_policy_flags,
 )
-from mjlab.utils.errors import UserError
+from mjlab.utils.errors import check_count
+from mjlab.utils.torch import threads_for_policy
 
 if TYPE_CHECKING:
     from mjlab.envs.manager_based_rl_env import ManagerBasedRlEnv
+
 # Methods of the simulation and the scene that a step calls, and the phase that each belongs to.
 _SIMULATION = {
     "step": "physics",
@@ -56,8 +58,6 @@ _TERM_METHODS = {
     "commands": ("compute", "reset"),
     "recorders": ("record_pre_reset", "record_post_reset", "record_post_step"),
 }
-
-
 # A term that takes more than this part of a step is worth a look.
 _MUCH = 5.0
 
@@ -93,14 +93,8 @@ def run_profile_env(task: str, cfg: ProfileConfig) -> dict[str, Any]:
     The environment is that of the task's training config, at random points of its episodes, so
     that resets come as often as they do while training.
     """
-    import torch
-
-    from mjlab.utils.torch import threads_for_policy
-
     for name, least in (("num_envs", 1), ("steps", 1), ("warm_up", 0)):
-        if (value := getattr(cfg, name)) < least:
-            flag = name.replace("_", "-")
-            raise UserError(f"--{flag} is {value}; it has to be at least {least}.")
+        check_count(f"--{name.replace('_', '-')}", getattr(cfg, name), least)
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
     env = make_env(
@@ -151,8 +145,6 @@ def _step(env: Any, policy: Any, count: int) -> float:
 
 def _wait_for(device: Any) -> None:
     if device.type == "cuda":
-        import torch
-
         torch.cuda.synchronize(device)
 
 
@@ -195,8 +187,13 @@ def _text(figures: dict[str, Any]) -> str:
             [((row["manager"], row["name"]), row) for row in figures["terms"]],
         ),
         "",
-        _note(figures["terms"]),
     ]
+    much = [row for row in figures["terms"] if row["percent"] > _MUCH]
+    names = (f"{row['manager']}/{row['name']} ({row['percent']:.1f} %)" for row in much)
+    if much:
+        lines.append(f"More than {_MUCH:g} % of the step: {', '.join(names)}.")
+    else:
+        lines.append(f"No term takes more than {_MUCH:g} % of the step.")
     return "\n".join(lines)
 
 
@@ -214,14 +211,6 @@ def _table(
 
     lines = [line(header, "ms", "%")]
     return lines + [line(names, f"{row['ms']:.3f}", f"{row['percent']:.1f}") for names, row in rows]
-
-
-def _note(terms: list[dict[str, Any]]) -> str:
-    much = [row for row in terms if row["percent"] > _MUCH]
-    if not much:
-        return f"No term takes more than {_MUCH:g} % of the step."
-    names = (f"{row['manager']}/{row['name']} ({row['percent']:.1f} %)" for row in much)
-    return f"More than {_MUCH:g} % of the step: {', '.join(names)}."
 
 
 # Timing of the methods that a step calls.
@@ -394,7 +383,10 @@ class _Instrumentation:
             return
         else:
             for name, cfg in zip(manager._term_names, manager._term_cfgs, strict=True):
-                self._time_function(phase, name, cfg)
+                function = cfg.func
+                timed = self._stopwatch.term(phase, name, function)
+                cfg.func = _TimedFunction(function, timed)
+                self._undo.callback(setattr, cfg, "func", function)
         for name, term in manager._class_terms.items():
             if callable(getattr(term, "reset", None)):
                 self._time_methods(phase, name, term, ("reset",))
@@ -402,11 +394,6 @@ class _Instrumentation:
     def _time_methods(self, phase: str, name: str, term: Any, methods: tuple[str, ...]) -> None:
         for method in methods:
             self._replace(term, method, lambda call: self._stopwatch.term(phase, name, call))
-
-    def _time_function(self, phase: str, name: str, cfg: Any) -> None:
-        function = cfg.func
-        cfg.func = _TimedFunction(function, self._stopwatch.term(phase, name, function))
-        self._undo.callback(setattr, cfg, "func", function)
 
     def _replace(
         self, owner: Any, name: str, wrap: Callable[[Callable[..., Any]], Callable[..., Any]]

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mjlab.scripts.run_folder import read_agent_params, read_env_params, read_run_info, sessions_of
 from mjlab.utils.errors import UserError
+from mjlab.utils.os import replacing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -138,13 +139,12 @@ class Reference:
 
     def save(self, folder: Path) -> Path:
         """Write the reference into `folder`, whole or not at all; return the file."""
-        # Imports torch, which `verify` does without until it trains.
-        from mjlab.rl.exporter_utils import write_atomically
-
         path = reference_path(folder, self.task, self.kind)
         # Not indented: smaller, and not meant to be read.
         text = json.dumps(_rounded(dataclasses.asdict(self))) + "\n"
-        write_atomically(path, text.encode())
+        folder.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as file:
+            file.write(text.encode())
         return path
 
     @classmethod

@@ -9,11 +9,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mjlab.rl.checkpoint import CheckpointError, learner_of_checkpoint, load_checkpoint
+from mjlab.rl.distributed import STORE_VARIABLE
+from mjlab.rl.learners import learner_of
 from mjlab.scripts.flags import profile_of_run
 from mjlab.scripts.run_folder import read_agent_params, read_env_params, read_run_info, run_folders
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
+from mjlab.utils.os import get_checkpoint_path, get_wandb_checkpoint_path
 from mjlab.utils.processes import process_rank
 from mjlab.utils.random import draw_seed
 
@@ -26,8 +30,8 @@ def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
     """Return the checkpoint that `cfg` asks to go on from, or None if it asks for a new run.
 
     It is the one with the highest number in the run of `task`, by the learner that `cfg` names, that
-    was changed last, of those that the patterns let through. Runs that do not name their task count as runs of any task; those that do
-    not name their learner, as runs of any learner.
+    was changed last, of those that the patterns let through. Runs that do not name their task count
+    as runs of any task; those that do not name their learner, as runs of any learner.
 
     Raises:
         UserError: the run asked for is of another task or learner, or a pattern is no regular
@@ -36,16 +40,22 @@ def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
     """
     if not cfg.agent.resume:
         return None
-    from mjlab.utils.os import get_checkpoint_path, get_wandb_checkpoint_path
-
     agent = cfg.agent
     experiment = Path(cfg.log_root).resolve() / agent.experiment_name
     if cfg.wandb_run_path is not None:
         run_path = Path(cfg.wandb_run_path)
         return get_wandb_checkpoint_path(experiment, run_path, cfg.wandb_checkpoint_name)[0]
-    for flag in ("load_run", "load_checkpoint"):
-        _check_pattern(f"--agent.{flag.replace('_', '-')}", getattr(agent, flag))
-    matching = _matching(experiment, agent.load_run)
+    for flag, pattern in (("run", agent.load_run), ("checkpoint", agent.load_checkpoint)):
+        try:
+            re.compile(pattern)
+        except re.error as error:
+            raise UserError(
+                f"--agent.load-{flag}: expected a regular expression, got {pattern!r}: {error}."
+            ) from error
+    # By the rule of `get_checkpoint_path`, newest first.
+    runs = run_folders(experiment)
+    matching = [run for run in runs if re.fullmatch(agent.load_run, run.name)]
+    matching = matching or [run for run in runs if re.match(agent.load_run, run.name)]
     others = {run.name: why for run in matching if (why := _other_kind(run, task, cfg.learner))}
     if others and len(others) == len(matching):
         raise UserError(_only_others(task, cfg.learner, agent.load_run, experiment, others))
@@ -66,9 +76,6 @@ def choices_to_resume(
     The profile is left out if the run had none, and the learner if the task chooses it anyway. Those
     of a Weights & Biases run are not known before it is fetched.
     """
-    from mjlab.rl.checkpoint import CheckpointError, learner_of_checkpoint
-    from mjlab.rl.learners import learner_of
-
     choices: dict[str, str | None] = {}
     if cfg.wandb_run_path is not None:
         return choices
@@ -100,9 +107,6 @@ def check_learner_resumes(cfg: TrainConfig, checkpoint: Path) -> None:
     Raises:
         CheckpointError: the checkpoint cannot be read.
     """
-    from mjlab.rl.checkpoint import learner_of_checkpoint
-    from mjlab.rl.learners import learner_of
-
     wanted, found = learner_of(cfg.agent), learner_of_checkpoint(checkpoint)
     if wanted != found:
         raise UserError(
@@ -116,8 +120,6 @@ def _speaks_for_the_run() -> bool:
 
     All of them read the flags. Our launcher has told it before it started the others.
     """
-    from mjlab.rl.distributed import STORE_VARIABLE
-
     return STORE_VARIABLE not in os.environ and process_rank().is_first
 
 
@@ -171,8 +173,6 @@ def is_finished(cfg: TrainConfig, runner: MjlabOnPolicyRunner, checkpoint: Path)
 
 def _saved_num_envs(checkpoint: Path) -> int | None:
     """Return how many environments the run of `checkpoint` had; None if nothing says so."""
-    from mjlab.rl.checkpoint import load_checkpoint
-
     # Runs of other tools keep no such state, but may have written down their config.
     for holder in (
         load_checkpoint(checkpoint).get("training_state"),
@@ -182,22 +182,6 @@ def _saved_num_envs(checkpoint: Path) -> int | None:
         if isinstance(count, int) and count >= 1:
             return count
     return None
-
-
-def _check_pattern(flag: str, pattern: str) -> None:
-    try:
-        re.compile(pattern)
-    except re.error as error:
-        raise UserError(f"{flag} is {pattern!r}, which is no regular expression: {error}.") from (
-            error
-        )
-
-
-def _matching(experiment: Path, pattern: str) -> list[Path]:
-    """Return the runs that `pattern` means by the rule of `get_checkpoint_path`, newest first."""
-    runs = run_folders(experiment)
-    exact = [run for run in runs if re.fullmatch(pattern, run.name)]
-    return exact or [run for run in runs if re.match(pattern, run.name)]
 
 
 def _other_kind(run_dir: Path, task: str, learner: str | None) -> str | None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import re
 import shutil
 import signal
-import threading
 from collections.abc import Callable, Generator
 from datetime import datetime
 from pathlib import Path
@@ -17,7 +17,8 @@ from typing import Any
 
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
-from mjlab.utils.os import remove_temporary_files
+from mjlab.utils.os import dump_yaml, remove_temporary_files, replacing
+from mjlab.utils.signals import FORWARDED, replace_handlers, restore_handlers
 
 _INFO_FILE = "run.json"
 _CHECKPOINT = re.compile(r"model_(\d+)\.pt")
@@ -81,31 +82,23 @@ def exit_by_signal(unless: Callable[[], bool]) -> Generator[None]:
     Where `unless` returns True they do what they always did. Those that are handled or ignored
     already are left alone, and so are all outside the main thread.
     """
-    replaced: list[int] = []
+    previous: dict[int, Any] = {}
 
     def handle(number: int, frame: FrameType | None) -> None:
-        restore()
+        restore_handlers(previous)
         if unless():
             os.kill(os.getpid(), number)
             return
         print_notice(f"{signal.Signals(number).name}: stopped before the first iteration.")
         raise SystemExit(128 + number)
 
-    def restore() -> None:
-        while replaced:
-            if signal.getsignal(number := replaced.pop()) is handle:
-                signal.signal(number, signal.SIG_DFL)
-
-    if threading.current_thread() is threading.main_thread():
-        for name in ("SIGTERM", "SIGHUP"):
-            number = getattr(signal, name, None)
-            if number is not None and signal.getsignal(number) is signal.SIG_DFL:
-                signal.signal(number, handle)
-                replaced.append(number)
+    ending = [n for n in FORWARDED if n != signal.SIGINT and signal.getsignal(n) is signal.SIG_DFL]
+    previous |= replace_handlers(handle, ending)
     try:
         yield
     finally:
-        restore()
+        # A handler that the block has installed stays.
+        restore_handlers({n: old for n, old in previous.items() if signal.getsignal(n) is handle})
 
 
 class SharedRunFolder:
@@ -121,14 +114,9 @@ class SharedRunFolder:
 
 def write_run_info(run_dir: Path, **info: Any) -> None:
     """Add entries to what `run_dir` says about its run (`run.json`)."""
-    path = run_dir / _INFO_FILE
     text = json.dumps({**read_run_info(run_dir), **info}, indent=2)
-    temporary = path.with_suffix(".tmp")
-    try:
-        temporary.write_text(text + "\n")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(run_dir / _INFO_FILE) as file:
+        file.write(f"{text}\n".encode())
 
 
 def write_resumed(run_dir: Path, checkpoint: Path) -> None:
@@ -172,6 +160,12 @@ def read_run_info(run_dir: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError):
         return {}
     return info if isinstance(info, dict) else {}
+
+
+def write_params(run_dir: Path, env: Any, agent: Any) -> None:
+    """Write the configs that a run was made with, for people and for `read_env_params`."""
+    dump_yaml(run_dir / "params" / "env.yaml", dataclasses.asdict(env))
+    dump_yaml(run_dir / "params" / "agent.yaml", dataclasses.asdict(agent))
 
 
 def read_agent_params(run_dir: Path) -> dict[str, Any]:
@@ -242,7 +236,10 @@ def resolve_checkpoint(path: Path, task: str) -> Path:
                 f"The newest run was {ended} before {path.name}. Its last checkpoint: {newest}"
             )
             return newest
-    raise UserError(_missing(path, task))
+    folders = [path.parent, *run_folders(path.parent)[:1]]
+    there = [str(file) for folder in folders for file in checkpoints_in(folder)[-3:]]
+    hint = f" There are: {', '.join(there)}." if there else f" `train {task}` makes some."
+    raise UserError(f"There is no checkpoint {path}.{hint}")
 
 
 def run_folders(experiment: Path) -> list[Path]:
@@ -252,16 +249,9 @@ def run_folders(experiment: Path) -> list[Path]:
     """
     if not experiment.is_dir():
         return []
+
+    def last_change(run_dir: Path) -> int:
+        return max((path.stat().st_mtime_ns for path in checkpoints_in(run_dir)), default=0)
+
     runs = [path for path in experiment.iterdir() if path.is_dir()]
-    return sorted(runs, key=lambda run: (_last_change(run), run.name), reverse=True)
-
-
-def _last_change(run_dir: Path) -> int:
-    return max((path.stat().st_mtime_ns for path in checkpoints_in(run_dir)), default=0)
-
-
-def _missing(path: Path, task: str) -> str:
-    folders = [path.parent, *run_folders(path.parent)[:1]]
-    there = [str(file) for folder in folders for file in checkpoints_in(folder)[-3:]]
-    hint = f" There are: {', '.join(there)}." if there else f" `train {task}` makes some."
-    return f"There is no checkpoint {path}.{hint}"
+    return sorted(runs, key=lambda run: (last_change(run), run.name), reverse=True)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Generator
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from mjlab.compat import older_names
 from mjlab.rl.distributed import (
@@ -21,7 +20,7 @@ from mjlab.rl.distributed import (
 )
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.devices import gpus_to_share, training_device
-from mjlab.scripts.display import KeepRunFolder, TrainingDisplay, leave_results, report_divergence
+from mjlab.scripts.display import leave_results, report_divergence, show_training
 from mjlab.scripts.environments import training_env, training_runner
 from mjlab.scripts.flags import (
     parse_with_choices,
@@ -43,16 +42,13 @@ from mjlab.scripts.run_folder import (
     NewRunFolder,
     SharedRunFolder,
     exit_by_signal,
+    write_params,
     write_resumed,
     write_run_info,
 )
 from mjlab.scripts.train_config import TrainConfig, check_flags, check_typed_flags
-from mjlab.utils.os import dump_yaml
 from mjlab.utils.processes import ProcessRank, end_with_launcher, process_rank
 from mjlab.utils.torch import prepare_torch
-
-if TYPE_CHECKING:
-    from mjlab.rl import MjlabOnPolicyRunner
 
 __getattr__ = older_names(__name__)
 
@@ -152,7 +148,11 @@ def _train(
                 print(f"Resumed: {checkpoint}, iteration {runner.current_learning_iteration}")
             print(f"Run:     {folder.path}", flush=True)
             if rank.is_first:
-                _write_params(task, cfg, folder.path, checkpoint)
+                info = {"profile": cfg.profile, "learner": cfg.learner_name, "command": sys.argv}
+                write_run_info(folder.path, task=task, **info)
+                if checkpoint is not None:
+                    write_resumed(folder.path, checkpoint)
+                write_params(folder.path, cfg.env, cfg.agent)
             try:
                 _learn(task, cfg, runner, folder)
             finally:
@@ -180,31 +180,13 @@ def _run_folder(
         yield new if rank.is_first else SharedRunFolder(path)
 
 
-def _write_params(task: str, cfg: TrainConfig, run_dir: Path, checkpoint: Path | None) -> None:
-    write_run_info(
-        run_dir, task=task, profile=cfg.profile, learner=cfg.learner_name, command=sys.argv
-    )
-    if checkpoint is not None:
-        write_resumed(run_dir, checkpoint)
-    dump_yaml(run_dir / "params" / "env.yaml", asdict(cfg.env))
-    dump_yaml(run_dir / "params" / "agent.yaml", asdict(cfg.agent))
-
-
 def _learn(
-    task: str,
-    cfg: TrainConfig,
-    runner: MjlabOnPolicyRunner,
-    folder: NewRunFolder | SharedRunFolder,
+    task: str, cfg: TrainConfig, runner: Any, folder: NewRunFolder | SharedRunFolder
 ) -> None:
     if isinstance(folder, SharedRunFolder):
         runner.learn(cfg.agent.max_iterations, init_at_random_ep_len=True)
         return
-    runner.observers += [KeepRunFolder(folder), TrainingDisplay(task)]
-    if cfg.live:
-        from mjlab.scripts.live import LiveView
-
-        # First, because the display keeps the terminal to itself once it has started.
-        runner.observers.insert(0, LiveView(task, cfg, runner))
+    show_training(task, cfg, runner, folder)
     try:
         runner.learn(cfg.agent.max_iterations, init_at_random_ep_len=True)
         # A task's own runner may have its own loop, which need not tell that it starts.

@@ -13,14 +13,13 @@ from mjlab.rl.config import RslRlBaseRunnerCfg
 from mjlab.rl.learners import Learner, learner_of
 from mjlab.scripts.flags import is_given
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
-from mjlab.utils.errors import BadCallError, UserError
+from mjlab.utils.errors import BadCallError, UserError, check_count
 from mjlab.utils.gpu import select_gpus
 from mjlab.utils.processes import ProcessRank, process_rank
 from mjlab.utils.random import process_seed
 from mjlab.viewer.page_server import check_address
 
 _AGENT_COUNTS = ("num_steps_per_env", "max_iterations", "save_interval")
-
 _ALGORITHM_COUNTS = (
     "num_learning_epochs",
     "num_mini_batches",
@@ -32,7 +31,6 @@ _ALGORITHM_COUNTS = (
     "noise_hold",
     "gradient_length",
 )
-
 _SEPARATORS = ("/", "\\")
 
 
@@ -120,9 +118,22 @@ class TrainConfig:
 
 
 def check_flags(cfg: TrainConfig) -> None:
-    """Raise UserError for what is wrong in the flags and can be told without building anything."""
+    """Raise UserError or ValueError for wrong flags that can be told without building anything."""
     _check_numbers(cfg)
-    _check_names(cfg)
+    # Names that would put the run's folder elsewhere than below that of all runs.
+    run_name, experiment = cfg.agent.run_name, cfg.agent.experiment_name
+    if any(separator in run_name for separator in _SEPARATORS):
+        raise UserError(
+            f"--agent.run-name is {run_name!r}; it is part of one folder's name and may not hold "
+            "a path separator. Runs are grouped by --agent.experiment-name."
+        )
+    if Path(experiment).is_absolute() or ".." in experiment.replace("\\", "/").split("/"):
+        raise UserError(
+            f"--agent.experiment-name is {experiment!r}; it names a folder within --log-root, so "
+            "it may be neither absolute nor contain '..'. Choose another place with --log-root."
+        )
+    if cfg.live:
+        check_address(cfg.live_host, cfg.live_port, "--live-")
 
 
 def check_typed_flags(cfg: TrainConfig, flags: list[str]) -> None:
@@ -138,7 +149,18 @@ def check_typed_flags(cfg: TrainConfig, flags: list[str]) -> None:
             "--wandb-run-path with it."
         )
     if is_given("--gpu-ids", flags) and cfg.gpu_ids is not None:
-        _check_gpus_are_used(cfg)
+        if cfg.device is not None and (
+            process_rank().is_alone or not cfg.device.startswith("cuda")
+        ):
+            raise BadCallError(
+                f"--gpu-ids: expected no --device beside it, got {cfg.device!r}; leave out one of "
+                "them."
+            )
+        if select_gpus(cfg.gpu_ids) == (None, 0):
+            raise BadCallError(
+                f"--gpu-ids: expected a GPU, got {cfg.gpu_ids} where none is visible; leave it out "
+                "to train on the CPU."
+            )
     # Networks and algorithms are chosen by their class names, and the runner by the task.
     kinds = {field.name: field.default for field in dataclasses.fields(cfg.agent)}
     name = getattr(cfg.agent, "class_name", None)
@@ -146,18 +168,6 @@ def check_typed_flags(cfg: TrainConfig, flags: list[str]) -> None:
         raise BadCallError(
             f"--agent.class-name: expected {kinds['class_name']!r}, got {name!r}, which nothing reads; "
             "use runner_cls of register_mjlab_task for a runner, or --learner."
-        )
-
-
-def _check_gpus_are_used(cfg: TrainConfig) -> None:
-    if cfg.device is not None and (process_rank().is_alone or not cfg.device.startswith("cuda")):
-        raise BadCallError(
-            f"--gpu-ids: expected no --device beside it, got {cfg.device!r}; leave out one of them."
-        )
-    if select_gpus(cfg.gpu_ids) == (None, 0):
-        raise BadCallError(
-            f"--gpu-ids: expected a GPU, got {cfg.gpu_ids} where none is visible; leave it out to "
-            "train on the CPU."
         )
 
 
@@ -183,8 +193,7 @@ def _check_numbers(cfg: TrainConfig) -> None:
         )
     counts |= {"--video-length": cfg.video_length, "--video-interval": cfg.video_interval}
     for flag, value in counts.items():
-        if value < 1:
-            raise UserError(f"{flag.replace('_', '-')} is {value}; it has to be at least 1.")
+        check_count(flag.replace("_", "-"), value)
     # An infinite bound, as of gradients, is one that is not there.
     for name, value in vars(agent.algorithm).items():
         if isinstance(value, float) and (
@@ -192,20 +201,3 @@ def _check_numbers(cfg: TrainConfig) -> None:
         ):
             flag = f"--agent.algorithm.{name.replace('_', '-')}"
             raise UserError(f"{flag}: expected a finite number, got {value}.")
-    if cfg.live:
-        check_address(cfg.live_host, cfg.live_port, "--live-")
-
-
-def _check_names(cfg: TrainConfig) -> None:
-    """Refuse names that would put the run's folder elsewhere than below that of all runs."""
-    run_name, experiment = cfg.agent.run_name, cfg.agent.experiment_name
-    if any(separator in run_name for separator in _SEPARATORS):
-        raise UserError(
-            f"--agent.run-name is {run_name!r}; it is part of one folder's name and may not hold "
-            "a path separator. Runs are grouped by --agent.experiment-name."
-        )
-    if Path(experiment).is_absolute() or ".." in experiment.replace("\\", "/").split("/"):
-        raise UserError(
-            f"--agent.experiment-name is {experiment!r}; it names a folder within --log-root, so "
-            "it may be neither absolute nor contain '..'. Choose another place with --log-root."
-        )

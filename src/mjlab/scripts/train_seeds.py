@@ -16,14 +16,8 @@ from mjlab.scripts.flags import is_given
 from mjlab.scripts.run_folder import read_run_info, run_folders
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.processes import PARENT_VARIABLE
+from mjlab.utils.signals import FORWARDED, handled_signals
 
-# Signals that end this process, and what the training process gets for each: it handles the first
-# two by saving.
-_FORWARDED: dict[int, signal.Signals] = {
-    signal.SIGINT: signal.SIGINT,
-    signal.SIGTERM: signal.SIGTERM,
-    signal.SIGHUP: signal.SIGTERM,
-}
 _SEEDS_HELP = "--seeds N    Train with the seeds 1, 2, ..., N, one after the other (default: 5)."
 
 
@@ -61,9 +55,7 @@ def _take_count(flags: list[str]) -> tuple[int, list[str]]:
                 value = flags[end] if end < len(flags) else ""
                 end += 1
             if not value.isdigit() or int(value) < 1:
-                raise UserError(
-                    f"--seeds is {value!r}; give the number of seeds, such as --seeds 5."
-                )
+                raise UserError(f"--seeds: expected an integer >= 1, got {value!r}.")
             return int(value), flags[:position] + flags[end:]
     return 5, flags
 
@@ -107,14 +99,9 @@ def run_forwarding_signals(command: list[str], seconds: float | None = None) -> 
         if child is None:
             early.append(number)
         else:
-            child.send_signal(_FORWARDED[number])
+            child.send_signal(FORWARDED[number])
 
-    # What is ignored, as SIGHUP under nohup, stays ignored.
-    handlers = {number: signal.getsignal(number) for number in _FORWARDED}
-    handlers = {number: old for number, old in handlers.items() if old != signal.SIG_IGN}
-    for number in handlers:
-        signal.signal(number, forward)
-    try:
+    with handled_signals(forward, FORWARDED):
         # A session of its own, because a terminal sends Ctrl-C to all processes of its session,
         # and a second signal tells training to stop at once.
         child = subprocess.Popen(
@@ -131,10 +118,6 @@ def run_forwarding_signals(command: list[str], seconds: float | None = None) -> 
             if not stopped:
                 child.send_signal(signal.SIGINT)
             return child.wait(), stopped
-    finally:
-        for number, old in handlers.items():
-            # A handler that was not set from Python reads as None and cannot be set again.
-            signal.signal(number, old if old is not None else signal.SIG_DFL)
 
 
 def plot_command(argv: list[str], prog: str) -> None:

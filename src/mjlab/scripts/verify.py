@@ -145,7 +145,10 @@ def report(reference: Reference, run: RunRecord, comparison: Comparison) -> str:
         "; ".join(dict.fromkeys(texts))
         for texts in (
             (", ".join(f"{n} {v}" for n, v in seed.versions.items()) for seed in reference.seeds),
-            (_machine(seed.machine) for seed in reference.seeds),
+            (
+                one.get("gpu") or f"{one.get('cores')} cores ({one.get('processor')})"
+                for one in (seed.machine for seed in reference.seeds)
+            ),
             (seed.commit for seed in reference.seeds),
         )
     )
@@ -175,10 +178,6 @@ def report(reference: Reference, run: RunRecord, comparison: Comparison) -> str:
             f"{min(taken):,} to {max(taken):,}, a healthy seed within {comparison.limit:,.0f}",
         ]
     return "\n".join([*lines, ""])
-
-
-def _machine(machine: dict) -> str:
-    return machine.get("gpu") or f"{machine.get('cores')} cores ({machine.get('processor')})"
 
 
 def _draw(reference: Reference, run: RunRecord, comparison: Comparison, output: Path) -> Path:

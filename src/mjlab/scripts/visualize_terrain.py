@@ -6,7 +6,7 @@ import dataclasses
 import threading
 import typing
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import mujoco
 import numpy as np
@@ -14,16 +14,16 @@ import tyro
 import viser
 
 import mjlab
+from mjlab.asset_zoo.robots import get_g1_robot_cfg, get_go1_robot_cfg
+from mjlab.scene import Scene, SceneCfg
 from mjlab.scripts.cli import run_alias
-from mjlab.terrains import SubTerrainCfg
+from mjlab.terrains import SubTerrainCfg, TerrainEntityCfg, TerrainGeneratorCfg
 from mjlab.terrains.config import ALL_TERRAIN_PRESETS
-from mjlab.utils.errors import UserError
+from mjlab.utils.errors import check_count, check_exists, check_in_range
 from mjlab.viewer.camera import CameraView
+from mjlab.viewer.page_server import check_address, page_url, serve_page
 from mjlab.viewer.viser.scene import MjlabViserScene
 
-if TYPE_CHECKING:
-    from mjlab.entity import EntityCfg
-    from mjlab.terrains import SubTerrainCfg
 RobotName = Literal["unitree_go1", "unitree_g1", "none"]
 Kind = Literal["number", "count", "range", "switch", "choice"]
 # What the page, not a control, decides, or what no slider can express.
@@ -64,25 +64,14 @@ def run_visualize_terrain(cfg: VisualizeTerrainConfig) -> None:
     """Serve the page until Ctrl-C.
 
     Raises:
-        UserError: no such preset, or figures that no terrain can have.
-        ValueError: the page cannot be served at that address.
+        ValueError: no such preset, or figures that no terrain can have; or the page cannot be served
+            at that address.
     """
-    from mjlab.viewer.page_server import check_address, page_url, serve_page
-
     check_address(cfg.host, cfg.port, "--")
-    from mjlab.terrains.config import ALL_TERRAIN_PRESETS
-
-    if cfg.terrain != "all" and cfg.terrain not in ALL_TERRAIN_PRESETS:
-        raise UserError(
-            f"There is no terrain preset {cfg.terrain!r}. Choose from: all, "
-            f"{', '.join(ALL_TERRAIN_PRESETS)}."
-        )
-    if not 1 <= cfg.num_levels <= 10 or not 4.0 <= cfg.size <= 16.0 or cfg.seed < 0:
-        raise UserError(
-            f"num_levels is {cfg.num_levels}, size {cfg.size} and seed {cfg.seed}; they must be "
-            "from 1 to 10, from 4 to 16 m, and not negative."
-        )
-
+    check_exists("terrain preset", cfg.terrain, (ALL, *ALL_TERRAIN_PRESETS))
+    check_in_range("num_levels", cfg.num_levels, 1, 10)
+    check_in_range("size", cfg.size, 4.0, 16.0)
+    check_count("seed", cfg.seed, 0)
     server = serve_page(cfg.host, cfg.port)
     page = TerrainPage(server, cfg.terrain, cfg.num_levels, cfg.size, cfg.seed, cfg.robot)
     print(f"Serving the terrain on {page_url(server)} (Ctrl-C stops).", flush=True)
@@ -140,7 +129,7 @@ class TerrainPage:
         for handle in (self._levels, self._size, self._seed, self._robot):
             handle.on_update(self._ask)
         self._terrain.on_update(self._choose)
-        self._add_knobs()
+        self._add_controls()
 
     @property
     def status(self) -> str:
@@ -202,10 +191,10 @@ class TerrainPage:
         self._changed.set()
 
     def _choose(self, _: Any) -> None:
-        self._add_knobs()
+        self._add_controls()
         self._ask()
 
-    def _add_knobs(self) -> None:
+    def _add_controls(self) -> None:
         """Replace the sliders by those of the chosen preset."""
         with self._lock, self._folder:
             for handle in self._handles.values():
@@ -275,9 +264,6 @@ def build_terrain_scene(
     Raises:
         ValueError: the terrain cannot be built.
     """
-    from mjlab.scene import Scene, SceneCfg
-    from mjlab.terrains import TerrainEntityCfg, TerrainGeneratorCfg
-
     generator = TerrainGeneratorCfg(
         seed=seed,
         curriculum=True,
@@ -288,16 +274,11 @@ def build_terrain_scene(
         add_lights=True,
     )
     terrain = TerrainEntityCfg(terrain_type="generator", terrain_generator=generator)
-    entities = {} if robot == "none" else {"robot": _robot_cfg(robot)}
+    robots = {"unitree_go1": get_go1_robot_cfg, "unitree_g1": get_g1_robot_cfg}
+    entities = {} if robot == "none" else {"robot": robots[robot]()}
     scene = Scene(SceneCfg(terrain=terrain, entities=entities), "cpu")
     model = scene.compile()
     return TerrainScene(model, scene["terrain"].terrain_origins.numpy(), count_polygons(model))
-
-
-def _robot_cfg(robot: RobotName) -> EntityCfg:
-    from mjlab.asset_zoo import robots
-
-    return robots.get_go1_robot_cfg() if robot == "unitree_go1" else robots.get_g1_robot_cfg()
 
 
 def count_polygons(model: mujoco.MjModel) -> int:

@@ -197,26 +197,24 @@ class NanPage:
         metadata, env = self.dump.metadata, self._envs[row]
         ids = metadata["nan_env_ids"]
         shown = ", ".join(map(str, ids[:_SHOWN_ENVS])) + (" ..." if len(ids) > _SHOWN_ENVS else "")
+        # What is not finite in the state, or else what is largest.
+        bad = [name for name in _FIELDS if not np.isfinite(getattr(self.data, name)).all()]
+        if bad:
+            findings = [f"Not finite here: {', '.join(bad)}"]
+        else:
+            findings = [
+                f"Largest |{name}|: {_largest(self.model, getattr(self.data, name))}"
+                for name in ("qvel", "qacc")
+                if self.model.nv > 0
+            ]
         lines = [
             f"**Substep {self.dump.steps[index]}** ({index + 1} of {len(self.dump.steps)} recorded; "
             f"NaN found after substep {metadata['detection_step'] - 1})",
             f"**Environment {env}**: {'went NaN' if env in ids else 'clean'}",
             f"Environments with NaN: {shown} ({len(ids)} of {metadata['num_envs_total']})",
-            *self._findings(),
+            *findings,
         ]
         return "\n\n".join(lines)
-
-    def _findings(self) -> list[str]:
-        """Return what is not finite in the state, or else what is largest."""
-        bad = [name for name in _FIELDS if not np.isfinite(getattr(self.data, name)).all()]
-        if bad:
-            return [f"Not finite here: {', '.join(bad)}"]
-        if self.model.nv == 0:
-            return []
-        return [
-            f"Largest |{name}|: {_largest(self.model, getattr(self.data, name))}"
-            for name in ("qvel", "qacc")
-        ]
 
 
 def _largest(model: mujoco.MjModel, values: Any) -> str:

@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from mjlab.utils.errors import MjlabError
+
 # Set for a child that is to end with the process that started it: the number of that process.
 PARENT_VARIABLE = "MJLAB_PARENT_PID"
 
@@ -81,6 +83,12 @@ def _number(variable: str, default: int) -> int:
             f"least {least}. torchrun sets it; unset it to train in one process."
         )
     return int(text)
+
+
+class OtherProcessError(MjlabError, RuntimeError):
+    """Another process of the run failed, and said why; this one cannot go on without it."""
+
+    exit_status = 3
 
 
 @functools.cache

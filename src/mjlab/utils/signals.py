@@ -1,4 +1,4 @@
-"""Signal handlers that are restored when their block ends: stop requests and the first Ctrl+C."""
+"""Signal handlers and restoring them: stop requests, the first Ctrl+C, signals for child processes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,39 @@ from typing import Any
 
 # Not on every system: SIGHUP, which a closed terminal sends.
 _HANGUP = getattr(signal, "SIGHUP", None)
+
+FORWARDED: dict[int, signal.Signals] = {
+    signal.SIGINT: signal.SIGINT,
+    signal.SIGTERM: signal.SIGTERM,
+    **({} if _HANGUP is None else {_HANGUP: signal.SIGTERM}),
+}
+"""Signals that end a process, and what a training process that it started gets for each: training
+saves at the first two."""
+
+
+def replace_handlers(
+    handler: Callable[[int, FrameType | None], None], numbers: Iterable[int]
+) -> dict[int, Any]:
+    """Let `handler` handle these signals; return the handlers before, for `restore_handlers`.
+
+    Outside the main thread, which alone can handle signals, nothing is changed.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    return {number: signal.signal(number, handler) for number in numbers}
+
+
+def restore_handlers(previous: dict[int, Any]) -> None:
+    """Put handlers back, and take them out of `previous`."""
+    while previous:
+        number, handler = previous.popitem()
+        # A handler that was not set from Python reads as None and cannot be set again.
+        signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+
+
+def not_ignored(numbers: Iterable[int]) -> list[int]:
+    """Return the signals that this process does not ignore, as one under `nohup` ignores SIGHUP."""
+    return [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 class StopRequest:
@@ -34,30 +67,23 @@ class StopRequest:
         return self.signal_name is not None
 
     def __enter__(self) -> StopRequest:
-        if threading.current_thread() is threading.main_thread():
-            numbers = [signal.SIGINT, signal.SIGTERM]
-            if _HANGUP is not None and signal.getsignal(_HANGUP) is not signal.SIG_IGN:
-                numbers.append(_HANGUP)
-            for number in numbers:
-                self._previous[number] = signal.signal(number, self._handle)
+        hangup = [] if _HANGUP is None else not_ignored([_HANGUP])
+        self._previous = replace_handlers(self._handle, [signal.SIGINT, signal.SIGTERM, *hangup])
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._restore_handlers()
+        restore_handlers(self._previous)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.signal_name = signal.Signals(number).name
-        self._restore_handlers(without=_HANGUP)
+        until_exit = {}
         if _HANGUP in self._previous:
+            until_exit[_HANGUP] = self._previous.pop(_HANGUP)
             signal.signal(_HANGUP, signal.SIG_IGN)
+        restore_handlers(self._previous)
+        self._previous = until_exit
         if self._on_request is not None:
             self._on_request(self.signal_name)
-
-    def _restore_handlers(self, without: int | None = None) -> None:
-        for number in [number for number in self._previous if number != without]:
-            handler = self._previous.pop(number)
-            # A handler that was not set from Python reads as None and cannot be set again.
-            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
 
 @contextlib.contextmanager
@@ -68,33 +94,23 @@ def handled_signals(
 
     Ignored signals, such as SIGHUP under `nohup`, stay ignored.
     """
-    previous = {
-        number: signal.signal(number, handle)
-        for number in numbers
-        if signal.getsignal(number) != signal.SIG_IGN
-    }
+    previous = replace_handlers(handle, not_ignored(numbers))
     try:
         yield
     finally:
-        for number, handler in previous.items():
-            # A handler that was not set from Python reads as None and cannot be set again.
-            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+        restore_handlers(previous)
 
 
 @contextlib.contextmanager
 def first_interrupt_calls(callback: Callable[[], None], enabled: bool) -> Generator[None]:
     """Let the first Ctrl+C call `callback`, and a second one interrupt as usual."""
-    if not enabled or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    previous = signal.getsignal(signal.SIGINT)
 
     def handler(signum: int, frame: Any) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         callback()
 
-    signal.signal(signal.SIGINT, handler)
+    previous = replace_handlers(handler, [signal.SIGINT] if enabled else [])
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, previous)
+        restore_handlers(previous)

@@ -152,7 +152,7 @@ def test_a_process_that_fails_before_training_is_named_and_leaves_no_folder(tmp_
 def test_what_is_wrong_in_all_processes_is_told_once(tmp_path):
     first, second = ProcessRun(tmp_path, "--agent.max-iterations", "0").end()
     assert (first.status, second.status) == (1, 3)
-    assert "--agent.max-iterations is 0" in first.err
+    assert "--agent.max-iterations: expected an integer >= 1, got 0" in first.err
     assert second.err == ""
 
 
@@ -199,7 +199,7 @@ def test_torchrun_trains_and_reports_a_failure(tmp_path):
         [*command, "--agent.max-iterations", "0"], capture_output=True, text=True, check=False
     )
     assert failed.returncode != 0
-    assert "--agent.max-iterations is 0" in failed.stderr
+    assert "--agent.max-iterations: expected an integer >= 1, got 0" in failed.stderr
 
 
 @pytest.mark.slow

@@ -51,7 +51,7 @@ def test_a_policy_of_weights_and_biases_is_played(run, trained, monkeypatch):
         asked.append((str(run_path), name))
         return trained / "model_1.pt", True
 
-    monkeypatch.setattr("mjlab.utils.os.get_wandb_checkpoint_path", fetch)
+    monkeypatch.setattr("mjlab.scripts.policy.get_wandb_checkpoint_path", fetch)
     outcome = run("play", TASK, *HEADLESS, "--wandb-run-path", "me/project/abc")
     assert outcome.status == 0, outcome.err
     assert asked == [("me/project/abc", None)]
@@ -97,8 +97,8 @@ def test_without_terminations_no_episode_ends(run, monkeypatch):
     ("flags", "named"),
     [
         (("--viewer", "none"), "--num-steps"),
-        (("--viewer", "none", "--num-steps", "0"), "--num-steps is 0"),
-        ((*HEADLESS, "--num-envs", "0"), "num_envs is 0"),
+        (("--viewer", "none", "--num-steps", "0"), "--num-steps: expected an integer >= 1, got 0"),
+        ((*HEADLESS, "--num-envs", "0"), "num_envs: expected an integer >= 1, got 0"),
         ((*HEADLESS, "--device", "gpu"), "'gpu'"),
     ],
 )
@@ -299,7 +299,7 @@ def test_the_same_seed_gives_the_same_figures_and_another_does_not(run):
 def test_no_episodes_are_refused(run):
     outcome = run("evaluate", TASK, "--agent", "zero", "--num-episodes", "0")
     assert outcome.status == 1
-    assert "--num-episodes is 0" in outcome.message
+    assert "--num-episodes: expected an integer >= 1, got 0" in outcome.message
 
 
 @pytest.mark.parametrize(

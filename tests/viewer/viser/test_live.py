@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from viewer_fakes import FakeEnv, push
 
-from mjlab.scripts import live
-from mjlab.scripts.live import LiveViewer, progress_html
+from mjlab.viewer.viser import live
+from mjlab.viewer.viser.live import LiveViewer, progress_html
 
 STATS = {
     "iteration": 30,

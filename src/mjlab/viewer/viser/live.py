@@ -1,0 +1,137 @@
+"""The browser viewer of a policy that is still learning."""
+
+from __future__ import annotations
+
+import html
+import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from mjlab.viewer.viser.viewer import ViserPlayViewer
+
+if TYPE_CHECKING:
+    import viser
+
+    from mjlab.viewer.base import EnvProtocol, PolicyProtocol
+
+# Times in seconds between two looks: for a browser while there is none, and for new weights.
+_SLEEP_UNWATCHED = 0.25
+_WEIGHTS_PERIOD = 0.25
+_PANEL_PERIOD = 0.5
+
+Stats = Mapping[str, Any]
+
+
+class LiveViewer(ViserPlayViewer):
+    """Plays the newest policy of a training run, and says how far training has got.
+
+    Without a browser nothing is stepped or drawn.
+    """
+
+    # Half of what the eye would like: what is left to do is training's.
+    scene_period = 1.0 / 20.0
+
+    def __init__(
+        self,
+        env: EnvProtocol,
+        policy: PolicyProtocol,
+        viser_server: viser.ViserServer,
+        title: str,
+        take_stats: Callable[[], Stats | None],
+        set_watched: Callable[[bool], None],
+    ) -> None:
+        """Prepare the viewer.
+
+        Args:
+            env: Environment or wrapper whose observations `policy` takes.
+            policy: Maps observations to actions; `take_stats` changes its weights.
+            viser_server: The page's server.
+            title: What is trained.
+            take_stats: Takes new weights over; returns the figures (`IterationStats`) of their
+                iteration, or None if there are no new ones.
+            set_watched: Is told whether a browser is connected, when that changes.
+        """
+        super().__init__(env, policy, frame_rate=20.0, viser_server=viser_server)
+        self._title = title
+        self._take_stats = take_stats
+        self._set_watched = set_watched
+        self._watched: bool | None = None
+        self._stats: Stats | None = None
+        self._stats_time = 0.0
+        self._next_weights = self._next_panel = 0.0
+        self._panel: viser.GuiHtmlHandle | None = None
+
+    def tick(self) -> bool:
+        """Do what is due, while a browser is connected; sleep while none is."""
+        watched = bool(self._server.get_clients())
+        if watched != self._watched:
+            self._watched = watched
+            self._set_watched(watched)
+        if not watched:
+            time.sleep(_SLEEP_UNWATCHED)
+            # No time has passed for the simulation either.
+            self._last_tick = time.perf_counter()
+            return True
+        now = time.perf_counter()
+        if now >= self._next_weights:
+            self._next_weights = now + _WEIGHTS_PERIOD
+            stats = self._take_stats()
+            if stats is not None:
+                self._stats, self._stats_time = stats, now
+        if now >= self._next_panel:
+            self._next_panel = now + _PANEL_PERIOD
+            self._show_progress()
+        return super().tick()
+
+    def add_first_panels(self) -> None:
+        """Add the progress of training."""
+        with self._server.gui.add_folder("Training"):
+            self._panel = self._server.gui.add_html("")
+        self._show_progress()
+
+    def _show_progress(self) -> None:
+        if self._panel is not None:
+            age = time.perf_counter() - self._stats_time
+            content = progress_html(self._title, self._stats, age)
+            if content != self._panel.content:
+                self._panel.content = content
+
+
+def progress_html(title: str, stats: Stats | None, age: float) -> str:
+    """How far training has got, with a bar.
+
+    Args:
+        title: What is trained.
+        stats: Figures of the iteration that the shown policy comes from; None before the first.
+        age: Seconds since the policy came.
+    """
+    name = f"<div><strong>{html.escape(title)}</strong></div>"
+    style = "padding:0.25em 1em;font-size:0.85em;line-height:1.5"
+    if stats is None:
+        return f'<div style="{style}">{name}Waiting for the first iteration …</div>'
+    done, total = stats["iteration"], stats["total_iterations"]
+    bar = (
+        '<div style="background:rgba(128,128,128,0.2);border-radius:2px;margin:0.3em 0">'
+        f'<div style="width:{100.0 * done / max(total, 1):.1f}%;height:6px;background:#1c7ed6;'
+        'border-radius:2px"></div></div>'
+    )
+    rows = [
+        ("Iteration", f"{done:,} of {total:,}"),
+        ("Mean reward", _number(stats["mean_reward"])),
+        ("Episode length", f"{_number(stats['mean_episode_length'], 0)} steps"),
+        ("Speed", f"{stats['steps_per_second']:,.0f} steps/s, {_time(stats['time_left'])} left"),
+        ("Policy", f"{age:.0f} s old"),
+    ]
+    lines = "".join(f"<div><strong>{row}:</strong> {value}</div>" for row, value in rows)
+    lines += '<div style="opacity:0.6">The view takes only the time that training leaves.</div>'
+    return f'<div style="{style}">{name}{bar}{lines}</div>'
+
+
+def _number(value: float | None, decimals: int = 2) -> str:
+    return "—" if value is None else f"{value:,.{decimals}f}"
+
+
+def _time(seconds: float) -> str:
+    minutes, seconds = divmod(int(max(seconds, 0.0)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
